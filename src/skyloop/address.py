@@ -1,7 +1,7 @@
-"""What may be shown of an address (never a user, a password or a key), and whether it is this machine's. Pure.
+"""Decide what may be shown of an address (never users, passwords or keys), and whether it is local. Pure.
 
-People also write passwords unquoted, with the characters that separate an address's parts. Where the end of such a
-password is ambiguous, everything after it is hidden as well.
+People also write passwords unquoted, including characters that separate the parts of an address. If it is ambiguous
+where a password ends, everything after it is hidden, too.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ HIDDEN: Final = "***"
 _SECRET: Final = "password|passwd|passphrase|pass|pwd|pw|token|secret|key|apikey|auth|credential|credentials"
 _SECRET_NAME: Final = re.compile(rf"(?i)(?:.*[_.-])?(?:{_SECRET})\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
-#: In a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``, where the end is ambiguous.
+#: A secret within a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``, whose end is ambiguous.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
 _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
-#: Prefixes of places that are devices: these have no user, even with an ``@`` in their path.
+#: Prefixes of places that are devices, which have no user even if their path contains an ``@``.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
 _KEEP: Final = "/:@*,;=()[]~!$'+"  # usual punctuation in addresses
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach the address."""
+    """Return whether the address can be reached only from this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -33,13 +33,13 @@ def is_loopback(host: str) -> bool:
 
 
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
-    """Return a part of an address without possible secrets: user, password, query and keys.
+    """Return a part of an address without anything that may be secret: user, password, query and keys.
 
     Args:
-        text: The address of a stream, another place, or the value of an option; percent-decoded.
+        text: The address of a stream, some other place, or the value of an option; percent-decoded.
         option: Name of the option, if ``text`` is its value.
-        broken: Whether a password in it may have been cut when the address was split.
-        place_of: Scheme of the vehicle's address, if ``text`` is its place.
+        broken: Whether splitting the address may have cut a password in it.
+        place_of: Scheme of the vehicle's address, if ``text`` is the place in it.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
@@ -59,7 +59,7 @@ def _hide(path: str) -> str:
 
 
 def shown_name(option: str) -> str:
-    """Return the name of an option to show: a text that is not a name may be the end of a password."""
+    """Return an option's name as it may be shown; if it is not a valid name, it may be the end of a password."""
     return option if _NAME.match(option) else HIDDEN
 
 
@@ -69,7 +69,7 @@ def is_broken(options: Iterable[str]) -> bool:
 
 
 def shown_address(text: str) -> str:
-    """Return a vehicle's address without possible secrets.
+    """Return a vehicle's address without anything that may be secret.
 
     Args:
         text: The user's input: ``scheme://place?option=value``, or anything else.

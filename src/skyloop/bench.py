@@ -1,4 +1,4 @@
-"""Measure the user's machine: delays beside the bare hand-over of the same bytes, and the simulator's speed.
+"""Measure the user's machine: delays, compared to a bare hand-over of the same bytes, and the simulator's speed.
 
 ``skyloop bench`` prints the results. The developers' measurements are in the repository's ``benchmarks/``.
 """
@@ -61,13 +61,13 @@ Image = NDArray[np.uint8]
 Setpoint = tuple[float, float, float]  #: forward and left [m/s], yaw rate [rad/s]
 #: Called for each received sample with its channel and sending time [ns, monotonic].
 Received = Callable[[str, int], None]
-#: Called with the share done so far, 0 to 1, and the next measurement.
+#: Called with the fraction done so far (0 to 1) and the next measurement.
 Progress = Callable[[float, str], None]
 
 COMMAND: Final = "command"
 FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
-#: The channels, and the periods [s] of the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
+#: The channels, and their periods [s] in the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
 LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
 
@@ -78,15 +78,15 @@ _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
 
 class Machine(msgspec.Struct, frozen=True):
-    """The machine behind the figures, without anything that identifies it or its user."""
+    """The machine on which figures were measured, without anything that identifies it or its user."""
 
     cpu: str
     cores: int  #: cores available to this process
     system: str
     kernel: str
     python: str
-    packages: dict[str, str] = {}  #: versions
-    load: float | None = None  #: load average of the minute before
+    packages: dict[str, str] = {}  #: versions of packages
+    load: float | None = None  #: load average over the preceding minute
 
     @classmethod
     def here(cls) -> Machine:
@@ -119,7 +119,7 @@ def os_name(os_release: str) -> str:
 
 
 def numbers_of(release: str) -> str:
-    """Return a kernel's release without its builder's suffix, which may name a machine."""
+    """Return a kernel's release without the builder's suffix, which may name a machine."""
     found = re.match(r"\d+(\.\d+)*", release)
     return found[0] if found else ""
 
@@ -150,7 +150,7 @@ def spread(times_ns: Sequence[float]) -> Spread:
     """Compute the median and the 99th percentile of times.
 
     Raises:
-        ValueError: There are no times: no sample arrived.
+        ValueError: There are no times, because no sample arrived.
     """
     if not times_ns:
         raise ValueError("not one sample arrived")
@@ -167,7 +167,7 @@ _UNIT_M_S: Final = 2.0**-46  # per nanosecond: 2**40 ns stay below 2 cm/s
 
 
 def stamped(sent_ns: int) -> float:
-    """Encode a time as a climb rate below 2 cm/s, which a command carries exactly within all limits."""
+    """Encode a time as a climb rate below 2 cm/s, which stays exact in a command and within all limits."""
     return (sent_ns % _WRAPS_NS) * _UNIT_M_S
 
 
@@ -209,7 +209,7 @@ class BenchVehicle(Driver):
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
-        if type(action) is Velocity and action.up != self._last_up:  # differs per call: equal ones are repeats
+        if type(action) is Velocity and action.up != self._last_up:  # differs in each call; equal ones are repeats
             self._last_up = action.up
             self._received(COMMAND, stamp_of(action.up, now_ns))
         return action
@@ -232,7 +232,7 @@ def proxy_name(folder: str) -> str:
 
 
 class Vehicle:
-    """The proxy's end, named after the folder of this run."""
+    """The proxy's end, named after this run's folder."""
 
     camera = USUAL_CAMERA
 
@@ -269,7 +269,7 @@ class Listening:
 
     def feedback(self, feedback: Feedback) -> None:
         """Report new feedback."""
-        if feedback.captured_ns > self._known_ns:  # the proxy repeats the last state when the authority changes
+        if feedback.captured_ns > self._known_ns:  # the proxy repeats the last state when the authority changes hands
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
 
@@ -283,7 +283,7 @@ class Listening:
 
 
 class Application:
-    """The end with the user's drone; start :class:`Vehicle` first."""
+    """The end that has the user's drone; start :class:`Vehicle` first."""
 
     looks = True  #: whether to receive the video
     video = VideoOptions()  #: format of the video
@@ -311,7 +311,7 @@ class Application:
 # The bare hand-over -------------------------------------------------------------------------------------------------
 
 _STAMP: Final = struct.Struct("<qqq")  # time of sending, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with zero size, and three numbers: 100 bytes, like Skyloop's
+_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with zero size, and three numbers: 100 bytes, as in Skyloop
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
@@ -319,7 +319,7 @@ class BareVehicle:
     """The hand-over without Skyloop: the minimum that any Python library must do to transfer the same bytes.
 
     One ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet is 100 bytes with the sending time. A
-    frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver makes an
+    frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver creates an
     array over the memory. Arguments and methods are those of :class:`Vehicle`.
     """
 
@@ -328,7 +328,7 @@ class BareVehicle:
         self._descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
-        self._memory[:] = 1  # map the pages before the first frame, like Skyloop's slots after their first use
+        self._memory[:] = 1  # map the pages before the first frame, as in Skyloop's slots after their first use
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
@@ -356,7 +356,7 @@ class BareVehicle:
         try:
             self._socket, _ = self._listener.accept()
         except OSError:
-            return  # closed before a connection
+            return  # closed before there was a connection
         with self._socket as sock:
             socket.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
@@ -404,14 +404,14 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
     SKYLOOP: (Vehicle, Application),
 }
 _TURN_S: Final = 5.0  # duration of a turn of one kind of hand-over
-_WARM_UP_S: Final = 0.4  # at the start of a turn, not counted: threads, slots and discovery of a new connection
-_SETTLE_S: Final = 0.3  # for the last samples of a turn to arrive
-_AHEAD_NS: Final = 50_000_000  # lead of the start time, so that both processes can start together
-_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process, beyond the turn
+_WARM_UP_S: Final = 0.4  # uncounted start of a turn, in which threads, slots and the connection are set up
+_SETTLE_S: Final = 0.3  # time for the last samples of a turn to arrive
+_AHEAD_NS: Final = 50_000_000  # how far ahead the start time is set, so that both processes can start together
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the turn
 _GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
-#: By channel: sending and receiving time of each sample [ns].
+#: Sending and receiving time of each sample [ns], by channel.
 _Arrivals = dict[str, list[tuple[int, int]]]
 
 
@@ -426,7 +426,7 @@ class _Turn(msgspec.Struct, frozen=True):
         return max(1, int(self.seconds / PERIODS_S[channel]))
 
     def paced(self, channel: str, begin_ns: int) -> Iterator[int]:
-        """Yield each sample's number when due, starting with the warm-up; a late one does not delay the others."""
+        """Yield each sample's number when due, starting with the warm-up; a late sample does not delay the others."""
         period_ns = PERIODS_S[channel] * 1e9
         phase = list(PERIODS_S).index(channel) * (1 + self.number) * _GOLDEN % 1.0
         for index in range(-int(_WARM_UP_S / PERIODS_S[channel]), self.count(channel)):
@@ -441,7 +441,7 @@ class DelayRow(msgspec.Struct, frozen=True):
     channel: str
     skyloop: Spread
     bare: Spread
-    lost: int  #: samples that Skyloop's receiver never got
+    lost: int  #: number of samples that Skyloop's receiver never got
 
 
 class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
@@ -460,7 +460,7 @@ def measure_delays(
     Args:
         seconds: Duration of each measurement at each frame size [s].
         sizes: Width and height of the frames, at most :data:`LARGEST`.
-        progress: Called with the share done so far, 0 to 1, and the next measurement's name.
+        progress: Called with the fraction done so far (0 to 1) and the next measurement's name.
 
     Raises:
         LinkError: The processes do not find each other, or nothing arrives.
@@ -488,7 +488,7 @@ def measure_delays(
 
 
 def named(size: tuple[int, int]) -> str:
-    """Return a size of frames for people."""
+    """Return a frame size for display."""
     return "×".join(map(str, size))
 
 
@@ -541,7 +541,7 @@ class _Pair:
 
 
 def _run_end(number: int, kind: str, side: str, folder: str) -> None:
-    """Run one end of a hand-over, turn by turn, until its pipe closes: the main function of a process."""
+    """Run one end of a hand-over, turn by turn, until its pipe closes. The main function of a process."""
     make, work = _ENDS[kind][side == "application"], _WORK[side]
     with Connection(number) as pipe, suppress(KeyboardInterrupt, EOFError, BrokenPipeError):
         while True:
@@ -593,7 +593,7 @@ _WORK: Final[dict[str, Callable[[Any, _Turn, int], None]]] = {"vehicle": _produc
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Drones in a world: their model, and whether firmware flies them with readings of all instruments."""
+    """Drones in a world: their model, and whether firmware with readings from all instruments flies them."""
 
     world: str
     drones: int
@@ -601,8 +601,8 @@ class Fleet:
     firmware: bool = False
 
 
-#: Free flight in an open hall, and a hundred drones crowded among gates, some touching them; then drones modelled down
-#: to their rotors in steps of a millisecond, one of them with all instruments.
+#: Free flight in an open hall; a hundred drones crowded among gates, some touching them; then drones modelled down to
+#: their rotors in steps of a millisecond, one of them with all instruments.
 FLEETS: Final = (
     Fleet("empty", 1),
     Fleet("empty", 10),
@@ -612,20 +612,20 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: image widths: the cameras' own, and twice that
+SIZES: Final = (1.0, 2.0)  #: factors for the image width: the cameras' own size, and twice that
 CAMERAS_AT_ONCE: Final = 10
-DRAWING_WORLD: Final = "room"  #: furnished, with markers and a moving board
+DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
 FRAMES_PER_S: Final = 30.0  #: per camera; the drones fly for one period between images
-#: A multiple of all periods in steps, so that every batch does the same work.
+#: Steps per batch: a multiple of all periods, so that every batch does the same work.
 BATCH_STEPS: Final = 100
-LEAST_ROUNDS: Final = 3  #: even if the time is short
-_TAKE_OFF_S: Final = 5.0  # simulated time before measuring
-#: Circles of half a metre, fast enough that the front camera's images are blurred by the rotation.
+LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if time is short
+_TAKE_OFF_S: Final = 5.0  # simulated time before measuring begins
+#: Circles with a radius of half a metre, fast enough that rotation blurs the front camera's images.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
-    """Drones that fly circles, or that firmware flies straight up and down, without rendering.
+    """Drones that fly circles, or that firmware makes fly straight up and down, without rendering.
 
     ``step`` is the time per step, from batches of :data:`BATCH_STEPS`.
     """
@@ -639,7 +639,7 @@ class PhysicsRow(msgspec.Struct, frozen=True):
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Rendering with the sensor's flaws. ``round``: the time for ``pictures`` images."""
+    """Rendering with the sensor's flaws. ``round`` is the time for ``pictures`` images."""
 
     cameras: str
     width: int
@@ -660,11 +660,11 @@ class SimResults(msgspec.Struct, frozen=True):
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
     """Measure physics and rendering on the calling thread, with OpenCV limited to that thread.
 
-    If Numba is installed, compiled code renders all images, from the first on.
+    If Numba is installed, compiled code renders all images, including the first.
 
     Args:
         seconds: Approximate duration, without the time to build the scenes [s].
-        progress: Called with the share done so far, 0 to 1, and the current measurement's name.
+        progress: Called with the fraction done so far (0 to 1) and the current measurement's name.
     """
     from skyloop.sim.render.compiled import COMPILER
 
@@ -701,7 +701,7 @@ def _measure_physics(fleet: Fleet, seconds: float, progress: Callable[[float], N
 
 
 def _measure_pair(factor: float, seconds: float, progress: Callable[[float], None]) -> list[DrawingRow]:
-    """Render the two cameras of one drone in turn, ``factor`` times as wide as the cameras' own images."""
+    """Render a drone's two cameras in turn, with images ``factor`` times as wide as the cameras' own."""
     from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
@@ -743,7 +743,7 @@ class Flight:
         self._number = 0
         self.picture: Image = np.empty(0, np.uint8)  #: the last image, BGR, shape (height, width, 3)
         for at in range(len(cameras)):
-            self.draw(at)  # a lens's first image computes its tables
+            self.draw(at)  # tables are computed for each lens's first image
 
     def draw(self, at: int) -> int:
         """Advance the flight, then render a camera's view with its sensor's flaws; return the rendering time [ns]."""
@@ -763,7 +763,7 @@ class Flight:
 
 
 class _Hops:
-    """Firmware that makes a drone hop: it reads everything and computes nothing."""
+    """Firmware that makes a drone hop. It reads everything but computes nothing."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
         """Return full thrust near the ground and none above."""
@@ -795,7 +795,7 @@ def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
 
 
 def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
-    """Yield until the time is up, but at least :data:`LEAST_ROUNDS` times."""
+    """Yield until time is up, but at least :data:`LEAST_ROUNDS` times."""
     begin, limit = time.monotonic_ns(), round(seconds * 1e9)
     done = 0
     while done < LEAST_ROUNDS or time.monotonic_ns() - begin < limit:

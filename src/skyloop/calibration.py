@@ -1,4 +1,4 @@
-"""A camera's calibration as a JSON file: the intrinsics, the image size, and the accuracy."""
+"""Camera calibrations as JSON files: the intrinsics, the image size, and the accuracy."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from skyloop import files
 from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
-MAX_BYTES: Final = 1 << 20  #: limit of a file's size; a calibration takes less than a kilobyte
+MAX_BYTES: Final = 1 << 20  #: maximum size of a file; a calibration takes less than a kilobyte
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-_SAME_SHAPE = 0.01  # tolerance of the aspect ratio: rounding of small images
+_SAME_SHAPE = 0.01  # tolerance for the aspect ratio, because the sizes of small images are rounded
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The result of :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
 
-    width: _Side  #: of the images [px]
+    width: _Side  #: width of the images [px]
     height: _Side
     model: str  #: ``pinhole`` or ``fisheye``
-    fx: float  #: [px], for images of this size, like all parameters
+    fx: float  #: focal length [px]; like all parameters, for images of this size
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()  #: as in :class:`Intrinsics`
+    distortion: tuple[float, ...] = ()  #: distortion coefficients, as in :class:`Intrinsics`
     rms_px: float | None = None  #: root mean square reprojection error of the corners
-    views: _Count = 0  #: images of the board used
-    rejected: _Count = 0  #: images rejected as outliers
-    coverage: float | None = None  #: share of the image area in which corners were seen, 0 to 1
+    views: _Count = 0  #: number of images of the board that were used
+    rejected: _Count = 0  #: number of images rejected as outliers
+    coverage: float | None = None  #: fraction of the image area in which corners were seen, 0 to 1
     fx_deviation: float | None = None  #: standard deviation of the focal length [px], estimated from the corners
-    camera: str = ""  #: a name for people
+    camera: str = ""  #: name of the camera, for display
 
     def __post_init__(self) -> None:
         if self.model not in _LENGTHS:
@@ -58,7 +58,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return abs(width / height - self.width / self.height) <= _SAME_SHAPE * width / height
 
     def intrinsics_for(self, width: int, height: int) -> Intrinsics:
-        """Scale the intrinsics to another image size. Raises :class:`UsageError` for another aspect ratio."""
+        """Scale the intrinsics to another image size. Raises :class:`UsageError` if the aspect ratio differs."""
         if not self.fits(width, height):
             raise UsageError(
                 f"the calibration is for {self.width}x{self.height} or the same aspect ratio, got {width}x{height}"

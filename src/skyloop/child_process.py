@@ -1,10 +1,10 @@
-"""Child processes that end with their parent, and safety of this process's objects after a fork.
+"""Child processes that end with their parent, and objects that are safe after a fork.
 
-A child's standard input is a pipe into which nothing is written. When the parent closes its end or dies, however it
-ends, the child reads the end of file (:func:`on_parent_end`) and exits, too.
+A child's standard input is a pipe into which nothing is written. When the parent closes its end or dies for any reason,
+the child reads the end of file (:func:`on_parent_end`) and exits, too.
 
-A child made by ``os.fork`` is different: it has copies of its parent's objects but none of its threads, and destroying
-the copies would destroy resources that the parent still uses (:func:`leave_to_parent`).
+A child made by ``os.fork`` is different: it has copies of its parent's objects but not its threads, and destroying the
+copies would destroy resources that the parent is still using (:func:`leave_to_parent`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, Final, Protocol
 
-GRACE_S: Final = 4.0  #: time for a child to exit when asked, and again when terminated
+GRACE_S: Final = 4.0  #: time for a child to exit on request, and again after being terminated
 _TAIL: Final = 2000  # bytes of a child's standard error shown in an error
 _LOOK_S: Final = 0.25  # how often to check a child that may fall silent
-#: How long to read a dead child's output: a grandchild that holds the pipe can keep it open longer.
+#: How long to read a dead child's output, because a grandchild can keep the pipe open.
 _DRAIN_S: Final = 1.0
-#: Data for a child in its environment, which only its user can read; a command line is readable by all users.
+#: Variable that hands data to a child: only its user can read its environment, but all users can read command lines.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
 _log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class LeftToParent(Protocol):
     def forked(self) -> None:
         """In a child made by ``os.fork``: keep all later calls away from the parent's resources.
 
-        Other threads are gone, and their locks may stay held forever: take none.
+        Other threads are gone, and their locks may stay held forever, so don't acquire any.
         """
 
 
@@ -57,7 +57,7 @@ def _leave_all() -> None:
     _left.clear()
 
 
-if hasattr(os, "register_at_fork"):  # without fork nothing is inherited
+if hasattr(os, "register_at_fork"):  # without fork, nothing is inherited
     os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
@@ -81,8 +81,8 @@ class ChildProcess:
 
         Args:
             command: Command line of the child.
-            keep_errors: Keep its standard error for :attr:`last_words`; if False, the child shares this process's
-                standard error.
+            keep_errors: Whether to keep its standard error for :attr:`last_words`; if False, the child shares this
+                process's standard error.
             inherited: File descriptors that the child inherits.
             handed: Data for :func:`handed_over` that must not be on a command line, which all users can read.
         """
@@ -123,19 +123,19 @@ class ChildProcess:
         """The end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._last_words
-        number = self._errors.fileno()  # read without seeking: the child writes at this file's position
+        number = self._errors.fileno()  # read without seeking, because the child writes at this file's position
         size = os.fstat(number).st_size
         return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
 
     @property
     def ending(self) -> str:
-        """How the child ended, for people; follows its name."""
+        """How the child ended, as text to follow its name."""
         code = self.code
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
     @property
     def quoted_output(self) -> str:
-        """The end of its standard error, to append to a message; empty if it wrote none."""
+        """The end of its standard error, to append to a message; empty if it wrote nothing."""
         text = self.last_words
         return f"; its output:\n{text}" if text else ""
 
@@ -175,7 +175,7 @@ class ChildProcess:
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
         """End the child like :meth:`end`, and close its output, which no thread may be reading. Idempotent."""
         if not self._ours:
-            return  # its output may be locked forever by a thread that the fork left behind
+            return  # a thread that the fork left behind may have locked its output forever
         self.end(grace_s, harder_s)
         self.stdout.close()
         self.close_errors()
@@ -189,10 +189,10 @@ class ChildProcess:
 
 @contextmanager
 def interrupt_deferred() -> Iterator[threading.Event]:
-    """Make Ctrl-C set an event within the block, and raise :class:`KeyboardInterrupt` only at its end.
+    """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at its end.
 
-    For ending several flights: raised midway, it would skip the remaining ones. Does nothing on other threads than the
-    main one, or if the program handles Ctrl-C itself.
+    Used for ending several flights, where an exception midway would skip the remaining ones. Does nothing on threads
+    other than the main one, or if the program handles Ctrl-C itself.
     """
     noted = threading.Event()
     on_main = threading.current_thread() is threading.main_thread()
@@ -209,14 +209,14 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return, once, the data that the parent handed over besides the command line; None if there is none."""
+    """Return, only once, the data that the parent handed over besides the command line; None if there is none."""
     return os.environ.pop(_HANDED, None)
 
 
 class RestartingChild:
     """Keeps one child running, restarting it whenever it ends, until :meth:`stop`. Any thread.
 
-    All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and each one is ended.
+    All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and every child is ended.
 
     Attributes:
         child: The current or last child; None before the first.
@@ -241,9 +241,9 @@ class RestartingChild:
             command: The children's command line.
             name: Name of the threads.
             read: Reads a child's ``stdout`` to its end, on a separate thread for each child.
-            ended: Called when a child has ended, with how it ended, for people; with None if one could not be started.
+            ended: Called when a child has ended, with a readable description, or with None if one could not be started.
                 Returns the pause before the next start [s]; None for no restart.
-            started: Called with each child, under the lock, before its output is read: must be quick.
+            started: Called with each child, under the lock, before its output is read; must be quick.
             silent: Returns whether the current child hangs and must be killed; called four times a second.
             keep_errors: See :class:`ChildProcess`.
             handed: See :class:`ChildProcess`.
@@ -274,7 +274,7 @@ class RestartingChild:
         return not self._keeper.is_alive()
 
     def start(self) -> None:
-        """Start the first child. Once.
+        """Start the first child. Call it only once.
 
         Raises:
             OSError: The child can't be started.
@@ -283,14 +283,14 @@ class RestartingChild:
         self._keeper.start()
 
     def request_stop(self) -> ChildProcess | None:
-        """Start no further child; return the current one, which keeps running. Does not wait. Idempotent."""
+        """Don't start any more children; return the current one, which keeps running. Does not wait. Idempotent."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
             return self.child
 
     def stop(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End the current child like :meth:`ChildProcess.end`, and start no further one. Idempotent."""
+        """End the current child like :meth:`ChildProcess.end`, and don't start any more. Idempotent."""
         child = self.request_stop()
         if child is not None:
             child.end(grace_s, harder_s)
@@ -330,14 +330,14 @@ class RestartingChild:
                 self.restarts += 1
             try:
                 child = self._begin()
-            except OSError as error:  # out of memory or descriptors for a moment
+            except OSError as error:  # temporarily out of memory or descriptors
                 child, ending = None, f"could not be started: {error}"
                 continue
             if child is None:
                 return
 
     def _wait(self, child: ChildProcess) -> str:
-        """Wait until a child has ended and its output is read; return how it ended, for people."""
+        """Wait until a child has ended and its output has been read; return how it ended, as readable text."""
         while child.wait(None if self._silent is None else _LOOK_S) is None:
             if self._silent is not None and self._silent():
                 child.kill()

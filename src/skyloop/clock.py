@@ -1,8 +1,8 @@
-"""Times and clocks: all times are integer nanoseconds on a monotonic clock, and decisions take the time as an argument.
+"""Times and clocks. All times are integer nanoseconds on a monotonic clock; decisions take the time as an argument.
 
-``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so ages across processes need no
-estimation. Time namespaces, as in containers, are the exception: :func:`clock_identity` tells them apart. Ages never
-use wall-clock time.
+``time.monotonic_ns`` is ``CLOCK_MONOTONIC``, which all processes of a host share, so ages across processes need not be
+estimated. Time namespaces, as in containers, are an exception: :func:`clock_identity` tells them apart. Ages never
+depend on wall-clock time.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Final
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
-#: Interval after which a thread hands over the interpreter lock in a process that serves vehicles. With Python's
-#: default of 5 ms, each packet of a flood could delay a command by that much.
+#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of
+#: 5 ms, each packet in a flood could delay a command by that much.
 SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns
@@ -37,10 +37,10 @@ def nanoseconds(s: float) -> int:
 
 
 def slept_ns() -> int:
-    """Return how long this computer has slept since it was started [ns]; 0 where that is unknown.
+    """Return how long this computer has slept since it was started [ns]; 0 if unknown.
 
-    The monotonic clock stops during sleep, so everything received before it is older than its timestamp suggests. The
-    result may lag for a moment, but is never too large.
+    The monotonic clock stops during sleep, so anything received earlier is older than its timestamp suggests. The
+    result may lag briefly, but is never too large.
     """
     if _BOOTTIME is None:
         return 0
@@ -48,7 +48,7 @@ def slept_ns() -> int:
 
 
 def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
-    """Yield once a period, by absolute deadlines, until ``ended`` is set; missed periods are skipped."""
+    """Yield once per period, on absolute deadlines, until ``ended`` is set; missed periods are skipped."""
     due_s = time.monotonic()
     while True:
         due_s = max(due_s + period_s, time.monotonic())
@@ -59,7 +59,7 @@ def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
 
 @functools.cache
 def boot_id() -> str:
-    """Return the identity of the running kernel's boot; empty where unknown, as on systems other than Linux."""
+    """Return an identifier of the kernel's current boot; empty if unknown, as on systems other than Linux."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -68,9 +68,9 @@ def boot_id() -> str:
 
 @functools.cache
 def clock_identity() -> str:
-    """Return the identity of this process's monotonic clock; processes with the same identity read the same clock.
+    """Return an identifier of this process's monotonic clock; processes with the same one read the same clock.
 
-    It names the boot of the host's kernel and the time namespace. Empty where the boot is unknown.
+    It consists of the kernel's boot and the time namespace. It is empty if the boot is unknown.
     """
     if not (boot := boot_id()):
         return ""
@@ -82,13 +82,13 @@ def clock_identity() -> str:
 
 
 class ManualClock:
-    """A clock that only moves when advanced, for tests and for simulation faster than real time."""
+    """A clock that moves only when advanced, for tests and for simulation faster than real time."""
 
     def __init__(self, start_ns: int = NS_PER_S) -> None:
         self.now_ns = start_ns
 
     def __call__(self) -> int:
-        """Return the present time [ns]."""
+        """Return the current time [ns]."""
         return self.now_ns
 
     def advance(self, seconds_: float) -> int:
@@ -104,10 +104,10 @@ class ManualClock:
 
 
 class LiveClock:
-    """Maps a live stream's timestamps to this host's clock; the smallest recent delay counts as no delay.
+    """Maps a live stream's timestamps to this host's clock, taking the smallest recent delay as zero.
 
-    Two windows, of which one is always complete, follow a stream whose clock runs slightly slower. Times never decrease
-    and are never in the future.
+    Two windows, of which one is always complete, adapt to a stream whose clock runs slightly slower. Times never
+    decrease, and are never in the future.
     """
 
     def __init__(self, window_s: float = 5.0) -> None:
@@ -122,10 +122,10 @@ class LiveClock:
 
         Args:
             stamp_s: Timestamp on the stream's clock [s]. A step back resets the estimate.
-            arrived_ns: On this host's monotonic clock.
+            arrived_ns: Time of arrival, on this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
-        if stamp_ns < self._stamp_ns:  # the stream's clock was set back: reset the estimate
+        if stamp_ns < self._stamp_ns:  # the stream's clock was set back, so reset the estimate
             self._before_ns = self._smallest_ns = None
         self._stamp_ns = stamp_ns
         offset_ns = arrived_ns - stamp_ns

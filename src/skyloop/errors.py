@@ -19,7 +19,7 @@
     ├── SwarmError                        some drones of a swarm failed; carries ``errors`` by name
     └── DriverError                       the vehicle's driver failed; carries what the vehicle reported
 
-The leaves tell the cause and the phase; catch the branch that you can handle.
+The leaves name the cause and the phase; catch the branch that you can handle.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from typing import Final, Self
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to ``most`` characters; its beginning and end stay, because causes are found at either.
+    """Shorten a text to ``most`` characters, keeping its beginning and end, because either may give the cause.
 
     Characters that can't be encoded as UTF-8, for example from invalid file names, become question marks.
     """
@@ -44,7 +44,7 @@ def shortened(text: str, most: int) -> str:
 
 
 class Hint(StrEnum):
-    """A possible remedy for an error. ``str(error)`` ends with it, worded for Python; the CLI has its own words."""
+    """A possible remedy for an error. ``str(error)`` ends with it, worded for Python; the CLI has its own wording."""
 
     SEARCH_NETWORK = "search the network"
     NAME_NETWORK = "name the network"
@@ -93,7 +93,7 @@ class UnknownNameError(UsageError, KeyError):
     """Raised when a name is unknown; ``suggestions`` holds the nearest known names, best first.
 
     Attributes:
-        kind: The kind of thing, for example ``camera``.
+        kind: What the name refers to, for example ``camera``.
         name: The name that was given.
         known: All known names, sorted.
         suggestions: Up to three similar known names.
@@ -104,10 +104,10 @@ class UnknownNameError(UsageError, KeyError):
         """Compose the message, with suggestions from the known names.
 
         Args:
-            kind: The kind of thing, for example ``camera``.
+            kind: What the name refers to, for example ``camera``.
             name: The name that was given.
             known: All known names.
-            where: Where it was searched for, to follow the name in the message: ``on the network``.
+            where: Where the name was looked up; it follows the name in the message, as in ``on the network``.
         """
         choices = sorted(set(known))
         self.kind = kind
@@ -139,7 +139,7 @@ class FileFormatError(UsageError):
 
 
 class NameTakenError(UsageError):
-    """Raised when the requested name is already in use; the message names the user."""
+    """Raised when the requested name is already in use; the message says what uses it."""
 
 
 class DecodeError(SkyloopError, ValueError):
@@ -150,10 +150,10 @@ class DecodeError(SkyloopError, ValueError):
 
 
 def install_command(*extras: str) -> str:
-    """Return the command that installs optional parts; it works in a checkout and for an installed wheel.
+    """Return the command that installs optional parts, both in a checkout and for an installed wheel.
 
     Args:
-        extras: Their names.
+        extras: Names of the optional parts.
     """
     return f"skyloop install {' '.join(extras)}"
 
@@ -241,4 +241,4 @@ class SwarmError(SkyloopError):
 
 
 class DriverError(SkyloopError):
-    """Raised when a vehicle's driver fails, or the vehicle refuses."""
+    """Raised when a vehicle's driver fails, or the vehicle refuses a request."""

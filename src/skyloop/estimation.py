@@ -1,4 +1,4 @@
-"""The common steps of all Kalman filters, and the assignment of measurements. Pure.
+"""The steps common to all Kalman filters, and the assignment of measurements. Pure.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001. A state has shape
 (n,), or (n, k) for k states that share one covariance, (n, n).
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 
 def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
-    """Return transition and process noise of positions and velocities, in this order, each (2·axes, 2·axes).
+    """Return the transition and process noise of positions followed by velocities, each (2·axes, 2·axes).
 
-    Continuous white-noise acceleration (section 6.2.2): two predictions equal one over both times.
+    Continuous white-noise acceleration (section 6.2.2): two predictions equal one over the total time.
 
     Args:
-        dt_s: The time.
+        dt_s: Duration [s].
         intensity: Intensity of the noise: within a second the velocity wanders by its root.
         axes: Number of positions.
     """
@@ -34,9 +34,9 @@ def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
 def corrected(
     state: Array, covariance: Array, off: Array, seen: Array, noise: Array, spread: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return state and covariance after a measurement, using Joseph's form (section 5.2.6).
+    """Return the state and covariance after a measurement, using Joseph's form (section 5.2.6).
 
-    The covariance stays positive in spite of rounding.
+    With it, the covariance stays positive in spite of rounding.
 
     Args:
         state: State before the measurement.
@@ -54,7 +54,7 @@ def corrected(
 
 
 def assignment(what: str, extra: str) -> Callable[[Array], tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return SciPy's ``linear_sum_assignment``: the pairs of least total cost, from costs (rows, columns).
+    """Return SciPy's ``linear_sum_assignment``, which finds the pairs (rows, columns) with the least total cost.
 
     Args:
         what: The feature that needs it, for the error.

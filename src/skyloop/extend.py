@@ -1,4 +1,4 @@
-"""A drone beyond its public API, for Skyloop's own controllers, recorder, cockpit, processors, ROS bridge and CLI.
+"""Access to a drone beyond its public API, for Skyloop's controllers, recorder, cockpit, processors, ROS and CLI.
 
 Only the client uses a drone's private attributes; every other package uses this module, which may change with any
 version. All functions are thread-safe and return at once unless their docstring says otherwise.
@@ -24,12 +24,12 @@ D = TypeVar("D", bound="Drone")
 
 
 class Known:
-    """A drone's state as known in this process. Reading it sends nothing, subscribes to nothing, and never raises."""
+    """What this process knows about a drone. Reading it sends nothing, subscribes to nothing, and never raises."""
 
     def __init__(self, drone: Drone) -> None:
         self._drone, state = drone, drone._state
         self.app: Final = state.app  #: name of this application, as in events
-        self.reach: Final = drone._reach  #: name or address for other processes to reach the vehicle; None: they can't
+        self.reach: Final = drone._reach  #: name or address at which others can reach the vehicle; None: they can't
         self.subscriber: Final = state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
 
     @property
@@ -39,7 +39,7 @@ class Known:
 
     @property
     def is_ending(self) -> bool:
-        """Whether the flight is being ended or the drone is closed: commands raise :class:`ClosedError`."""
+        """Whether the flight is being ended or the drone is closed, so that commands raise :class:`ClosedError`."""
         return self._drone._piloting.ending
 
     @property
@@ -59,28 +59,28 @@ class Known:
 
 
 class Commands(Protocol):
-    """The commands of this application and their outcomes. Each command is an intent and has a number."""
+    """This application's commands and their outcomes. Each command is an intent and has a number."""
 
     @property
-    def newest(self) -> AnyAction: ...  #: the set-point that is being repeated; idle if there is none
+    def newest(self) -> AnyAction: ...  #: the set-point being repeated; idle if there is none
     @property
     def intent(self) -> int: ...  #: number of the newest intent
     @property
     def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps the vehicle in the air or brings it there
     @property
-    def may_ask(self) -> bool: ...  #: whether there is a connection with the authority
+    def may_ask(self) -> bool: ...  #: whether there is a connection on which this application holds the authority
     @property
     def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
 
-    def outcome(self, intent: int) -> Outcome | None: ...  #: how it ended; None while it is in progress
+    def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
     def release(self, *, wait: bool = True) -> None: ...  #: release the authority; NoAnswerError if the proxy is silent
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # Presence of the person who flies. While they must be present but are not, set-points are not repeated and new ones
+    # Presence of the person flying. While they must be present but are not, set-points are not repeated and new ones
     # are refused. Commands that end a flight are sent once, and emergency stops work as always.
     def flown_by_person(self) -> None: ...  #: require their presence from now on
-    def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens it
+    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never shortens it
     def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
 
 
@@ -90,24 +90,24 @@ def commands(drone: Drone) -> Commands:
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
-    """Send ``action``, with numbers already checked, as :meth:`skyloop.Drone.command`; return the intent's number."""
+    """Send ``action``, with checked numbers, like :meth:`skyloop.Drone.command`; return the intent's number."""
     return drone._commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
-    """Hover or land because the library, not a person, decides that it must. Never raises.
+    """Hover or land because the library, not a person, has decided to. Never raises.
 
     Leaves the vehicle alone if others fly it, if it is landing or returning, or if the application itself has landed or
-    stopped it. A take-off that does not show yet is cancelled. Without the authority, only the set-point is dropped.
+    stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.
 
     Args:
         drone: The drone.
         reason: The reason, for the log.
-        land: Land, rather than hover.
-        for_good: Later commands of the application raise :class:`ClosedError`, except for an emergency stop.
+        land: Whether to land rather than hover.
+        for_good: Whether the application's later commands, except for an emergency stop, raise :class:`ClosedError`.
 
     Returns:
-        Whether something was sent.
+        Whether anything was sent.
     """
     if for_good:
         drone._commands.bar()
@@ -119,7 +119,7 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
 
     Args:
         kind: ``Drone``, or a class derived from it.
-        dial: Connects to the proxy, now and after each loss.
+        dial: Connects to the proxy, first now and again after each loss.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time for the proxy to answer and to send feedback [s].
         **options: See :class:`skyloop.client.drone.DroneOptions`.
@@ -133,7 +133,7 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
 
 
 def connect_to_stop(name: str, app: str) -> Drone:
-    """Connect to a running proxy as a pilot that waits for no feedback and never requests the authority.
+    """Connect to a running proxy as a pilot, without waiting for feedback or ever requesting the authority.
 
     Raises the same errors as :func:`skyloop.connect`.
     """
@@ -145,7 +145,7 @@ def connect_to_stop(name: str, app: str) -> Drone:
 
 
 def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | None:
-    """Land or hover as ``on_exit`` says if this application flies the vehicle, then close. Waits until it has landed.
+    """If this application flies the vehicle, land (and wait) or hover, depending on ``on_exit``; then close.
 
     ``report`` is called on this thread with a text for each step. Returns the error, or None if everything worked.
     """
@@ -160,8 +160,8 @@ def video_channel(
     Args:
         drone: The drone.
         camera: Name of the camera; None: the vehicle's first.
-        max_fps: Most frames a second; None: all.
-        part: (k, n): only every n-th frame, from k; None: all.
+        max_fps: Maximum number of frames a second; None: all.
+        part: (k, n): only every n-th frame, starting from k; None: all.
 
     Raises:
         UnknownNameError: If the vehicle has no camera of this name.
@@ -173,28 +173,28 @@ def video_channel(
 
 
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-    """Return the channel of a camera's H.264: with no options, as the vehicle itself encoded it.
+    """Return the channel of a camera's H.264; without options, pictures are as the vehicle itself encoded them.
 
-    It calls its consumers on the receiving thread, and raises what :func:`video_channel` raises.
+    Consumers are called on the receiving thread. Errors are those of :func:`video_channel`.
     """
     return drone._state.video.stream(camera, **how)
 
 
 class InboxOptions(TypedDict, total=False):
-    """Samples that one thread waits for."""
+    """Which samples one thread waits for."""
 
-    feedback: bool  #: whether feedback is wanted; True if left out
-    frames: bool  #: whether frames are wanted; True if left out
+    feedback: bool  #: whether feedback is wanted; the default is True
+    frames: bool  #: whether frames are wanted; the default is True
     camera: str | None  #: name of the camera; None: the vehicle's first
     results: bool  #: whether results of processors are wanted
     processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
-    max_age_s: float | None  #: oldest age of a result that is accepted [s]; None: any
+    max_age_s: float | None  #: maximum age of a result [s]; None: any
 
 
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
-    """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+    """Return mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
 
-    They fill while they are open as a context manager. It raises what :func:`video_channel` raises.
+    They are a context manager, and fill while it is open. Errors are those of :func:`video_channel`.
     """
     from skyloop.client.telemetry import Mailboxes
 
@@ -204,21 +204,21 @@ def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
 def join_processor(
     drone: Drone, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
 ) -> Membership:
-    """Become a worker of a processor, as ``skyloop process`` does, up to the drone's end. Waits for the proxy's answer.
+    """Become a worker of a processor, as ``skyloop process`` does, until the drone is closed. Waits for the answer.
 
     Args:
         drone: The drone.
         name: Name of the processor.
-        code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
+        code: Identifies the code, which is the same for all workers with this name; at most 128 characters.
         camera: Name of the camera; None: the vehicle's first.
-        shared: Each frame goes to one of the workers; if False, each worker gets all.
+        shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
         timeout_s: How long to wait [s].
 
     Raises:
         NameTakenError: If another application runs other code under this name.
         RefusedError: If the proxy refuses for another reason.
         NoAnswerError: If the proxy does not answer in time.
-        UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
+        UsageError: If ``name`` or ``code`` is unusable, or if called from an inline callback.
         UnknownNameError: If the vehicle has no camera of this name.
     """
     from skyloop.client.publishing import Membership

@@ -1,4 +1,4 @@
-"""Injects faults into transports, identically for the same seed. Pure: the sender handles time."""
+"""Inject faults into transports, identically for the same seed. Pure: the sender handles time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Faults:
 
 
 class FaultInjector:
-    """The faults of one direction of one connection. Not thread-safe."""
+    """Injects the faults for one direction of one connection. Not thread-safe."""
 
     def __init__(self, faults: Faults, key: str) -> None:
         self._faults = faults

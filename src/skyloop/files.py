@@ -1,4 +1,4 @@
-"""File access: bounded reading and decoding with one kind of error, atomic replacing, waiting for readability."""
+"""File access: bounded reading and decoding with a single kind of error, atomic replacement, waiting for data."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from skyloop.errors import FileFormatError, UsageError
 
 T = TypeVar("T")
 
-MAX_TEXT: Final = 1 << 20  #: bytes of a hand-written list
-MAX_RESULTS: Final = 256 << 20  #: bytes of a file of measurements; those of an hour take some megabytes
+MAX_TEXT: Final = 1 << 20  #: bytes in a hand-written list
+MAX_RESULTS: Final = 256 << 20  #: bytes in a file of measurements; an hour's worth takes a few megabytes
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
-    """Read a file of at most ``most`` bytes. ``what`` describes its content for people.
+    """Read a file of at most ``most`` bytes. ``what`` describes its content in error messages.
 
     Raises :class:`FileFormatError` if it can't be read or is larger.
     """
@@ -68,7 +68,7 @@ class Descriptor(Protocol):
 
 
 def wait_readable(source: Descriptor | int, within_s: float) -> bool:
-    """Wait until a descriptor is readable or closed; return False if not within ``within_s`` [s].
+    """Wait until a descriptor is readable or closed; return False if it is neither within ``within_s`` [s].
 
     Works for any descriptor number; ``select.select`` raises from 1,024 on.
     """
@@ -80,7 +80,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; that of an unknown user stays as it is and is not found."""
+    """Expand ``~`` to the home directory; for an unknown user, the path stays as it is and won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -93,7 +93,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Devices and pipes are written to directly. Raises :class:`UsageError` for an ``OSError``.
     """
-    place = Path(os.path.realpath(path))  # replace the target of a link and keep the link
+    place = Path(os.path.realpath(path))  # replace the target of a link, and keep the link
     special = place.exists() and not place.is_file()
     part = place if special else place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
     try:

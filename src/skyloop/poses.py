@@ -1,4 +1,4 @@
-"""Poses as SciPy's ``RigidTransform``: of the body, its cameras and seen things. Needs the extra ``control``.
+"""Poses of the body, its cameras and targets, as SciPy's ``RigidTransform``. Needs the extra ``control``.
 
 ``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s.
 Poses chain with ``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up
@@ -46,7 +46,7 @@ def attitude(feedback: Feedback) -> Rotation:
 
 
 def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """Return the vehicle's pose; a given ``position`` (3,) [m] takes precedence over the vehicle's own.
+    """Return the vehicle's pose; a given ``position`` (3,) [m] replaces the vehicle's own.
 
     Raises :class:`UsageError` while attitude or position is unknown.
     """
@@ -57,7 +57,7 @@ def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> Rigi
 
 
 def camera_in_body(camera: CameraInfo) -> RigidTransform:
-    """Return a camera's mounting; a camera with unknown position counts as at the body's centre.
+    """Return the pose in which a camera is mounted; if its position is unknown, the body's centre is assumed.
 
     Raises :class:`UsageError` if its orientation is unknown.
     """
@@ -65,7 +65,7 @@ def camera_in_body(camera: CameraInfo) -> RigidTransform:
 
 
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """Return a camera's pose in the state of ``feedback``(``frame.feedback`` for an image).
+    """Return a camera's pose when the vehicle is in the state ``feedback`` (``frame.feedback`` for an image).
 
     ``position`` and errors as for :func:`body_in_world` and :func:`camera_in_body`.
     """
@@ -75,12 +75,12 @@ def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike 
 def target_in_world(
     target_in_camera: RigidTransform, camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None
 ) -> RigidTransform:
-    """Return the pose of a thing seen by a camera, such as :attr:`MarkerSighting.pose`, by ``feedback``."""
+    """Return the pose of something seen by a camera, such as :attr:`MarkerSighting.pose`, given ``feedback``."""
     return camera_in_world(camera, feedback, position) * target_in_camera
 
 
 def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
-    """Return the rotation from a camera's optical axes to body axes, shape (3, 3); needs no extra.
+    """Return the rotation from a camera's optical axes to body axes, shape (3, 3). Needs no extra.
 
     Raises :class:`UsageError` if the camera's mounting is unknown.
     """

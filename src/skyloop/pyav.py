@@ -1,4 +1,4 @@
-"""PyAV's decoders and encoders, created in one place: PyAV is optional, and imported when the first one is created."""
+"""Create PyAV's decoders and encoders in one place: PyAV is optional, and imported when first needed."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def new_decoder(
     """Create a decoder that returns each image at once.
 
     Args:
-        codec: FFmpeg's name of the codec.
+        codec: FFmpeg's name for the codec.
         purpose: As for :func:`require_pyav`.
-        patch: Fill damaged parts from earlier images; otherwise a damaged image is an error.
-        low_delay: False for a stream whose images depend on later ones: it delays them until those arrive.
+        patch: Whether to fill damaged parts from earlier images; if not, a damaged image is an error.
+        low_delay: False for a stream whose images depend on later ones, until whose arrival they are delayed.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -49,7 +49,7 @@ def new_decoder(
     if patch:
         context.flags |= av.codec.context.Flags.output_corrupt
     else:
-        # For H.264 also refuse an image with leftover bits; for MPEG-4 such a check would refuse every end of a
+        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse every end of a
         # sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)
@@ -60,18 +60,18 @@ def new_decoder(
 
 
 def limit_memory(context: CodecContext) -> None:
-    """Limit a decoder's memory: a damaged header must not make it allocate gigabytes."""
+    """Limit a decoder's memory, because a damaged header must not make it allocate gigabytes."""
     context.options = {**context.options, "max_pixels": str(MAX_PIXELS)}
 
 
-_TICK: Final = Fraction(1, 1_000_000)  # time base of the encoder's rate control [s]
-#: How much of a second's data a stream may send at once: the size of a key frame. A slow link has to carry it before
-#: the next image.
+_TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate control [s]
+#: Fraction of a second's data that a stream may send at once, which limits the size of a key frame. A slow link has to
+#: carry it before the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3  # greatest increase of a rate that will change
-_FALLS: Final = 12  # below 1/12 of its maximum rate, a single image occupies the link for too long
+_GROWS: Final = 3  # maximum factor by which a variable rate increases
+_FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
 _KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
-#: The colours of PAL television, with 16 to 235 from black to white: what FFmpeg converts to, and decoders expect.
+#: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
 
@@ -85,11 +85,11 @@ class H264Encoder:
         height: Height of the images [px], even.
         fps: Approximate frame rate.
         kbit_s: Average rate [kbit/s].
-        varies: Whether the rate will change, up to three times as high. x264 fixes the largest burst when it starts, so
-            a steady rate is kept more strictly.
+        varies: Whether the rate will change, increasing up to threefold. x264 fixes the largest burst when it starts,
+            so a constant rate is kept more strictly.
 
     Raises:
-        MissingExtraError: PyAV is not installed, or without x264.
+        MissingExtraError: PyAV is not installed, or lacks x264.
     """
 
     def __init__(self, width: int, height: int, fps: float, kbit_s: int, *, varies: bool = False) -> None:
@@ -120,7 +120,7 @@ class H264Encoder:
             "x264-params": f"repeat-headers=1:scenecut=0:sliced-threads=0:{_COLOURS}",
         }
         context.open()
-        # x264 accepts a later change of rate only if it started with a maximum rate, and never above it.
+        # x264 accepts a later change of rate only if it was started with a maximum rate, and only up to that.
         context.bit_rate = kbit_s * 1000
         self._context = context
         self._fresh = True
@@ -137,11 +137,11 @@ class H264Encoder:
     def encode(
         self, pixels: NDArray[np.uint8], form: str, captured_ns: int, *, key: bool = False
     ) -> tuple[bytes, bool]:
-        """Encode one image, letting other threads run meanwhile.
+        """Encode one image, letting other threads run in the meantime.
 
         Args:
             pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous; any size is scaled.
-            form: FFmpeg's name of the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
+            form: FFmpeg's name for the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
             captured_ns: Capture time [ns], later than the previous one.
             key: Whether to make it a key frame.
 

@@ -1,6 +1,6 @@
-"""Processors on a Ray cluster: like ``skyloop process``, but as actors placed by Ray. Needs the extra ``ray``.
+"""Run processors on a Ray cluster, as ``skyloop process`` does, but in actors placed by Ray. Needs the extra ``ray``.
 
-Frames and results travel between proxy and actors as usual; Ray starts the actors and restarts them when they die.
+Frames and results are exchanged with the proxy as usual; Ray starts the actors, and restarts them when they die.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any, Final, Self
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.processing import Code, Settings, Status, Worker, load_processor
 
-_ASK_S: Final = 10.0  #: time for an actor to return its status
+_ASK_S: Final = 10.0  #: time limit for an actor to return its status
 _LOOK_S: Final = 0.1  # how often to check whether all actors have started
-_START_S: Final = 60.0  #: time for Ray to place and start all actors
-#: Environment variables of this program with which a worker finds the proxy.
+_START_S: Final = 60.0  #: time limit for Ray to place and start all actors
+#: This program's environment variables that a worker needs to find the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
 
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """The task of an actor, sent to the actor's host."""
+    """An actor's task, sent to its host."""
 
     kind: type[Any]
     drone: str
@@ -38,11 +38,11 @@ class Workers:
     """The actors of one processor, created by :func:`process`. A context manager that ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
-        """Keep Ray's handles of the actors."""
-        self.actors = actors  #: Ray's handles
+        """Keep Ray's handles for the actors."""
+        self.actors = actors  #: Ray's handles for the actors
 
     def statuses(self, timeout_s: float = _ASK_S) -> list[Status | None]:
-        """Return the statistics of each actor; None for one that does not answer, for example during a restart.
+        """Return each actor's statistics; None for one that does not answer, for example because it is restarting.
 
         Args:
             timeout_s: How long to wait for all actors [s].
@@ -94,7 +94,7 @@ def process(
     stuck_s: float = 2.0,
     **options: Any,
 ) -> Workers:
-    """Run a processor as actors of a Ray cluster; return when all of them work.
+    """Run a processor as actors on a Ray cluster; return when all of them are working.
 
     Uses the cluster that this program is connected to, or else starts one on this host.
 
@@ -104,17 +104,17 @@ def process(
         workers: Number of actors, at least 1.
         camera: Name of the camera; None: the vehicle's first.
         name: Name of the processor; None: the class's in lower case.
-        shared: Each frame goes to one of the workers; if False, each worker gets all frames.
-        max_age_s: Skip frames older than this at their turn [s]; None: skip none.
-        max_fps: Frame rate limit of each worker; None: no limit.
-        stuck_s: A longer call of ``process`` gives the worker's share to the others [s].
+        shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
+        max_age_s: Frames older than this when their turn comes are skipped [s]; None: no limit.
+        max_fps: Maximum frame rate of each worker; None: no limit.
+        stuck_s: If a call of ``process`` takes longer than this [s], the worker's share goes to the others.
         **options: Options of Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged
             with, and takes precedence over, the environment variables with which an actor finds the proxy.
 
     Raises:
         MissingExtraError: Ray is not installed.
         UsageError: An argument is out of range, or the class is not a processor.
-        NoAnswerError: Ray has no room for that many actors within 60 s.
+        NoAnswerError: Ray does not find room for that many actors within 60 s.
         LinkError: An actor fails; the message says why.
     """
     ray = _ray()
@@ -125,7 +125,7 @@ def process(
     if not ray.is_initialized():
         ray.init(include_dashboard=False, log_to_driver=False)
     module = sys.modules[code.kind.__module__]
-    if module.__name__.startswith("skyloop_user_"):  # loaded from a file: another host can't import it
+    if module.__name__.startswith("skyloop_user_"):  # it was loaded from a file, which other hosts can't import
         ray.cloudpickle.register_pickle_by_value(module)
     options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
@@ -140,7 +140,7 @@ def process(
 
 
 def _runtime_env(wanted: Any) -> dict[str, Any]:
-    """Return the user's ``runtime_env`` with the variables with which an actor finds the proxy."""
+    """Return the user's ``runtime_env``, extended by the variables that an actor needs to find the proxy."""
     wanted = {} if wanted is None else wanted
     variables = wanted.get("env_vars") or {} if isinstance(wanted, Mapping) else None
     if not isinstance(variables, Mapping):
@@ -197,7 +197,7 @@ class _Actor:
             self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:
-        """Return the worker's statistics, and why it has ended, if it has."""
+        """Return the worker's statistics and, if it has ended, the reason."""
         return None if self._worker is None else self._worker.status, self._trouble
 
 

@@ -1,4 +1,4 @@
-"""Read TOML files into msgspec structs, with errors that give the place in the file, the value and the allowed ones."""
+"""Read TOML files into msgspec structs, with errors that give the place, the value and the allowed values."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from skyloop.errors import FileFormatError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 1 << 18  #: limit of a file; the largest world shipped takes 5 kB
-#: Parts of a key: a parser walks through all of them for each key below, which takes minutes with ten thousand.
+MAX_BYTES: Final = 1 << 18  #: bytes in a file; the largest world shipped takes 5 kB
+#: Maximum number of parts in a key. A parser visits all of them for each key below: minutes, if there are ten thousand.
 MAX_DEPTH: Final = 16
 MAX_WHOLE: Final = (1 << 63) - 1  #: TOML's limit; larger numbers are neither shown nor used
-#: msgspec inspects a struct's fields on its first conversion, and crashes if two threads do so at once.
+#: Held during conversions: msgspec inspects a struct's fields on the first one, and crashes if two threads do so.
 _converting = threading.Lock()
 _SHOWN: Final = 80  #: characters of a wrong value in a message
-# Possessive quantifiers, and a start at a part's start, avoid backtracking: a miss is as fast as a match.
+# Possessive quantifiers, and starting only where a part starts, avoid backtracking: a miss is as fast as a match.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
 _WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # the end of a msgspec error
@@ -35,22 +35,22 @@ _KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a t
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A table of a file, for error messages."""
+    """A table in a file, for error messages."""
 
     source: str  #: the file's name
-    table: str = ""  #: its name in the file; empty for top-level keys
+    table: str = ""  #: the table's name; empty for top-level keys
 
     def under(self, key: str) -> Place:
         """Return the place of a table inside this one."""
         return Place(self.source, f"{self.table}.{key}" if self.table else key)
 
     def item(self, key: str, number: int, name: object) -> Place:
-        """Return the place of one of several tables, by name or by number from 1."""
+        """Return the place of one of several tables, by its name or its number, starting with 1."""
         place = self.under(key).table
         return Place(self.source, f"{place} {name!r}" if isinstance(name, str) and name else f"{place} #{number}")
 
     def error(self, key: str, problem: str) -> FileFormatError:
-        """Create an error about a key of the table."""
+        """Create an error about a key in the table."""
         where = [self.source, f"[{self.table}]"] if self.table else [self.source]
         return FileFormatError(f"{', '.join(where)}, key {key!r}: {problem}")
 
@@ -83,7 +83,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
     """Convert parsed values to a struct.
 
     Args:
-        values: From :func:`parse_toml`.
+        values: The result of :func:`parse_toml`.
         source: The file's name, for messages.
         kind: A :class:`msgspec.Struct`, with tables and lists of tables as fields, that forbids unknown keys.
 
@@ -98,7 +98,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Complete msgspec's error, which has only the place and the expected type, with the given value and a hint."""
+    """Add the given value and a hint to msgspec's error, which has only the place and the expected type."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():
@@ -124,7 +124,7 @@ def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileF
 def _wrong_key(
     place: Place, table: dict[str, Any], fields: dict[str, tuple[inspect.Type, bool]], message: str
 ) -> FileFormatError:
-    """Create the error about an unknown or missing key, or about both if one is the other misspelt."""
+    """Create the error about an unknown or missing key, or about both if one is a misspelling of the other."""
     unknown = [key for key in table if key not in fields]
     missing = [key for key, (_, required) in fields.items() if required and key not in table]
     for key in missing:
@@ -149,14 +149,14 @@ def _plain(info: inspect.Type) -> Any:
 
 
 def _tables(info: inspect.Type) -> list[inspect.StructType]:
-    """Return the kinds of table that a value can be."""
+    """Return the kinds of tables that a value can be."""
     plain = _plain(info)
     kinds = plain.types if isinstance(plain, inspect.UnionType) else [plain]
     return [kind for kind in kinds if isinstance(kind, inspect.StructType)]
 
 
 def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
-    """Return each key's type and whether it is required; of several kinds take the one that the table names."""
+    """Return each key's type and whether it is required; of several kinds, use the one that the table names."""
     kinds = _tables(info)
     tag = kinds[0].tag_field
     fields: dict[str, tuple[inspect.Type, bool]] = {}
@@ -174,7 +174,7 @@ def _choices(info: inspect.Type) -> tuple[str, ...]:
 
 
 def _wanted(info: inspect.Type, place: Place) -> str:
-    """Return in words what a value must be; ``place`` is the value's."""
+    """Return a description of what a value must be; ``place`` is the value's place."""
     if isinstance(info, inspect.Metadata) and info.extra_json_schema:
         return str(info.extra_json_schema["description"])
     plain = _plain(info)
@@ -196,7 +196,7 @@ def _wanted(info: inspect.Type, place: Place) -> str:
 
 
 def _range(low: float | None, high: float | None) -> str:
-    """Describe a number between these bounds; the largest float stands for no upper bound."""
+    """Describe a number between these bounds; the largest float means no upper bound."""
     least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
     if least and most:
         return f"a number from {low:g} to {high:g}"

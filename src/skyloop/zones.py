@@ -1,4 +1,4 @@
-"""Where a vehicle may fly: a room's walls, the safety box, and the no-fly zones; all upright, in world axes. Pure.
+"""Where a vehicle may fly: the walls of a room, the safety box, and no-fly zones; all upright, in world axes. Pure.
 
 World axes are x east, y north, z up [m]. The proxy decides what a vehicle does near these walls.
 """
@@ -14,15 +14,15 @@ from typing import Final, NamedTuple
 from skyloop.errors import ParameterError
 from skyloop.messages import Refusal, Value
 
-FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away does not count
+FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is ignored [m]
 MAX_ZONES: Final = 32
-#: Thinner zones are enlarged to this thickness, so that an overshoot or a gust does not end on their far side [m].
+#: Thinner zones are enlarged to this thickness [m], so that an overshoot or a gust can't carry a vehicle across.
 THINNEST_M: Final = 0.5
-BOX: Final = "safety.box"  #: prefix of the box's parameters
+BOX: Final = "safety.box"  #: prefix of the parameters for the box
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
-MAX_NAME: Final = 24  #: letters of a zone's name
+MAX_NAME: Final = 24  #: characters in a zone's name
 _SHAPES: Final = {"box": 6, "cylinder": 5}
 _NAME: Final = re.compile(rf"[^:;,\x00-\x1f\x7f]{{1,{MAX_NAME}}}")
 
@@ -30,7 +30,7 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane: the unit vector towards it in world axes, and its distance [m], negative beyond it."""
+    """A plane: the unit vector towards it in world axes, and its distance [m], which is negative beyond it."""
 
     normal: Vec3
     distance: float
@@ -40,7 +40,7 @@ class Wall(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """An upright box along the world's axes."""
+    """An upright box parallel to the world axes."""
 
     low: Vec3
     high: Vec3
@@ -67,18 +67,18 @@ class Box:
         )
 
     def holds(self, place: Vec3) -> bool:
-        """Return whether a place is inside or on the surface."""
+        """Return whether a position is inside or on the surface."""
         return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two places crosses it."""
+        """Return whether the straight line between two positions crosses it."""
         first, last = 0.0, 1.0
         for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
             first, last = _within(low, high, at, to, first, last)
         return first <= last
 
     def thickened(self) -> Box:
-        """Return the box, at least :data:`THINNEST_M` thick along each axis, with the same centre."""
+        """Return the box with the same centre, made at least :data:`THINNEST_M` thick along each axis."""
         x, y, z = (_thickened(low, high) for low, high in zip(self.low, self.high, strict=True))
         low, high = (x[0], y[0], z[0]), (x[1], y[1], z[1])
         return self if (low, high) == (self.low, self.high) else replace(self, low=low, high=high)
@@ -114,11 +114,11 @@ class Cylinder:
         return Wall((0.0, 0.0, up), along, ZONES, self.name)
 
     def holds(self, place: Vec3) -> bool:
-        """Return whether a place is inside or on the surface."""
+        """Return whether a position is inside or on the surface."""
         return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two places crosses it."""
+        """Return whether the straight line between two positions crosses it."""
         first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
         if first > last:
             return False
@@ -129,7 +129,7 @@ class Cylinder:
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
     def thickened(self) -> Cylinder:
-        """Return the cylinder, at least :data:`THINNEST_M` thick, with the same centre."""
+        """Return the cylinder with the same centre, made at least :data:`THINNEST_M` thick."""
         radius, (low, high) = max(self.radius, THINNEST_M / 2), _thickened(self.low, self.high)
         if (radius, low, high) == (self.radius, self.low, self.high):
             return self
@@ -147,10 +147,10 @@ class Space:
     """Where a vehicle may fly.
 
     Attributes:
-        room: The room's walls, which the vehicle can't pass; None: unknown.
-        box: The safety box; None: there is none.
+        room: The room's walls, which the vehicle can't pass; None if unknown.
+        box: The safety box; None if there is none.
         zones: The no-fly zones, as written.
-        barriers: The same, but at least :data:`THINNEST_M` thick.
+        barriers: The zones, made at least :data:`THINNEST_M` thick.
     """
 
     room: Box | None = None
@@ -159,12 +159,12 @@ class Space:
     barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)  # the zones as they are enforced
 
     def __post_init__(self) -> None:
-        """Thicken the zones that are too thin."""
+        """Thicken zones that are too thin."""
         object.__setattr__(self, "barriers", tuple(zone.thickened() for zone in self.zones))
 
     @property
     def walled(self) -> bool:
-        """Whether there are walls that limit set-points; those of a room do not."""
+        """Whether there are walls that limit set-points, which a room's walls do not."""
         return self.box is not None or bool(self.zones)
 
     @property
@@ -173,7 +173,7 @@ class Space:
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
-        """Return why the vehicle may not fly to a place, and where it may, for people; empty if it may."""
+        """Return why the vehicle may not fly to a position, and where it may, as readable text; empty if it may."""
         if self.room is not None and not self.room.holds(place):
             return f"the place is outside the room, {self.room} [m] ({ROOM})"
         if self.box is not None and not self.box.holds(place):
@@ -184,9 +184,9 @@ class Space:
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
-        """Return what blocks the straight line between two places, for people; empty if nothing does.
+        """Return what blocks the straight line between two positions, as readable text; empty if nothing does.
 
-        A zone that contains the start does not count, so that a vehicle can leave it.
+        A zone that contains the start is ignored, so that a vehicle can leave it.
         """
         for zone, kept in zip(self.zones, self.barriers, strict=True):
             if not kept.holds(start) and kept.is_in_the_way(start, end):
@@ -195,7 +195,7 @@ class Space:
 
 
 def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
-    """Return the space that parameters allow a vehicle to fly in.
+    """Return the space in which parameters allow a vehicle to fly.
 
     Args:
         number: Returns the value of a numeric parameter by its name.
@@ -214,7 +214,7 @@ def _room(text: str) -> Box | None:
     try:
         zones = parse_zones(text)
     except ParameterError:
-        return None  # a driver that uses this name for something else
+        return None  # a driver uses this name for something else
     return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
 
 
@@ -222,8 +222,8 @@ def parse_zones(text: str) -> tuple[Zone, ...]:
     """Parse zones, separated by semicolons.
 
     Args:
-        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, world axes [m]; a name and a
-            colon may precede each: ``tree: cylinder 1 2 0.5 0 3``.
+        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. Each may be
+            preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.
 
     Raises:
         ParameterError: The text can't be parsed, or has too many zones.
@@ -261,7 +261,7 @@ def _parse_zone(text: str) -> Zone:
 
 
 def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
-    """Check a value of a safety parameter against the others.
+    """Check a new value for a safety parameter against the others.
 
     Raises:
         ParameterError: A wall of the box is beyond the opposite one, or the zones can't be parsed.

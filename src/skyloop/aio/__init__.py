@@ -1,4 +1,4 @@
-"""Drones and swarms for ``asyncio``: methods that wait are coroutines, the others plain calls.
+"""Drones and swarms for ``asyncio``: methods that wait are coroutines, others are plain functions.
 
 ::
 
@@ -8,8 +8,8 @@
             drone.velocity(forward=0.3)
 
 They wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which run in their own threads and are available as
-:attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the waiting, but does not undo the request that it
-waited for.
+:attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the wait, but does not undo the request that it
+was waiting for.
 """
 
 from skyloop.aio.bridge import Callback, Config, Drone, Listener, Swarm, connect, swarm

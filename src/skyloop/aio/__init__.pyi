@@ -40,7 +40,7 @@ __all__ = ["Callback", "Config", "Drone", "Listener", "Swarm", "connect", "swarm
 class Config:
     """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
 
-    Writing needs the authority. See :class:`skyloop.client.Config` for how written values are kept.
+    Writing needs the authority. :class:`skyloop.client.Config` explains how written values are kept.
     """
 
     sync: client.Config
@@ -63,7 +63,7 @@ class Config:
             ParameterError: If the proxy refuses it, with its reason.
             AuthorityError: If the authority is not held.
             UnknownNameError: If there is no such parameter; carries suggestions.
-            UsageError: If the value's type is not one of a parameter.
+            UsageError: If no parameter can have a value of this type.
             LinkError: If the link broke before the answer and the parameter is momentary: it may have been executed.
         """
     async def items(self) -> list[tuple[str, Value]]:
@@ -110,7 +110,7 @@ class Drone:
         """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def log(self) -> client.Logbook:
-        """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
+        """Publishes text and numbers during the flight; see :class:`skyloop.client.Logbook`."""
     def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
@@ -124,17 +124,17 @@ class Drone:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them. ``encoding``: how
-                frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80), ``"h264"`` (of
-                ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and fewer pictures
-                where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: frames older than this
-                when their turn comes are skipped and counted as dropped.
+                ``part``: (k, n), only every n-th frame, so that n workers, with k from 0, can share the frames.
+                ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
+                ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
+                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
             NoAnswerError: If no frame arrives within ``timeout_s``.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or from an inline callback.
+            UsageError: If an option is out of range, or if called from an inline callback.
             ClosedError: If the drone was already closed.
         """
     def results(
@@ -142,7 +142,7 @@ class Drone:
     ) -> AsyncIterator[client.Result]:
         """Yield a processor's newest result repeatedly until the drone is closed.
 
-        A slow loop skips results; these and those that are too old are counted in :attr:`stats`. Errors are raised by
+        A slow loop skips results; :attr:`stats` counts them, as well as those that are too old. Errors are raised by
         the first iteration, not by the call.
 
         Args:
@@ -152,7 +152,7 @@ class Drone:
 
         Raises:
             NoAnswerError: If no sufficiently new result arrives in time.
-            UsageError: If ``processor`` is not a valid name, ``max_age_s`` is negative, or from an inline callback.
+            UsageError: If ``processor`` is invalid, ``max_age_s`` is negative, or if called from an inline callback.
             ClosedError: If the drone was already closed.
         """
     async def close(self) -> None:
@@ -169,14 +169,14 @@ class Drone:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay over all pilots, for which this asks the proxy and waits up to 0.2 s.
+        callback. Otherwise it is the delay across all pilots, requested from the proxy with a wait of up to 0.2 s.
         """
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Run the checklist before a flight; each finding has its reason and a remedy.
+        """Run the pre-flight checklist; each finding comes with a reason and a remedy.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Asks the proxy for its parameters, and each camera for a picture. Flies nothing and needs no authority.
+        Reads the proxy's parameters and requests a picture from each camera. Doesn't fly and needs no authority.
 
         Args:
             video_s: Total time to wait for pictures [s]; 0: don't check cameras.
@@ -191,39 +191,40 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        While this waits, a take-off for which the vehicle is not ready yet is retried twice a second. A failed call,
-        including a time-out and Ctrl-C, cancels the take-off: the vehicle hovers if it is in the air, otherwise it
-        stays on the ground. Without ``wait``, a refused take-off is not retried.
+        If the vehicle is not ready yet, the take-off is retried twice a second during the wait. If the call fails, for
+        example by a time-out or Ctrl-C, the take-off is cancelled: the vehicle hovers if it is in the air, otherwise
+        it stays on the ground. Without ``wait``, a refused take-off is not retried.
 
         Args:
             wait: Wait until the vehicle hovers or flies; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle does not hover in time; the text has its state and, if known, the reason.
+            NoAnswerError: If the vehicle does not hover in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses the take-off in the present state; if a failsafe, a lost link, a new
-                lease or another command of this application ends it before it shows; if the application lands the
-                vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever reason.
+                lease or another command of this application ends it before it takes effect; if the application lands
+                the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
+                reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not take off later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; then nothing is sent.
+            UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the current position.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        While this waits, a landing ended by a failsafe, a lost link or a lost lease is commanded again. If the
-        vehicle's own link breaks, the proxy continues the landing, even if no one waits for it.
+        A landing interrupted by a failsafe, a lost link or a lost lease is commanded again during the wait. If the
+        vehicle's own link breaks, the proxy continues the landing, even if no application is waiting for it.
 
         Args:
             wait: Wait until the vehicle has landed; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle has not landed in time; the text has its state and, if known, the reason.
+            NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
             LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
@@ -251,38 +252,38 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        World axes are those of ``Feedback.position_m``. If the vehicle knows its place on the earth
+        World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
         ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application falls
-        silent: the vehicle stops there. It is held until the next command, even after a time-out; after Ctrl-C or a
-            cancelled task, the vehicle hovers. The flight does not avoid obstacles.
+        position does not decay when the application goes silent: the vehicle stops there. It is held until the next
+        command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
+        obstacles.
 
         Args:
             x: East [m].
             y: North [m].
             z: Up [m].
-            latitude_deg: [°], north positive; instead of x, y and z.
-            longitude_deg: [°], east positive.
-            altitude_m: Above mean sea level [m]; None: the current height.
-            yaw: Counter-clockwise from x, reached on the way [rad]; None: keep the current one.
+            latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
+            longitude_deg: Longitude [°], east positive.
+            altitude_m: Altitude above mean sea level [m]; None: the current height.
+            yaw: Yaw, counter-clockwise from x, reached on the way [rad]; None: keep the current yaw.
             speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
-            wait: Wait until the vehicle is there and nearly at rest; otherwise only send the command.
+            wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
-            tolerance_m: Distance from the position that counts as there [m].
-            tolerance_rad: The same for ``yaw`` [rad].
+            tolerance_m: Maximum distance from the position at arrival [m].
+            tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
 
         Raises:
-            NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
+            NoAnswerError: If it does not arrive in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
-                ends it. Also if latitude and longitude are given but the vehicle's place is unknown.
+                ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
-                then nothing is sent.
+                nothing is sent in that case.
         """
     async def return_to_start(
         self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
@@ -303,14 +304,14 @@ class Drone:
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it has not ended in time; the text has the vehicle's state and, if known, the reason.
+            NoAnswerError: If it is not over in time; the message gives the vehicle's state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not return later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If an argument makes no sense, or with ``wait`` from an inline callback; nothing is sent then.
+            UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
         """
     async def request_authority(
         self,
@@ -331,9 +332,9 @@ class Drone:
         pre-emption it returns when the other application releases it.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
             wait_s: How long to wait in the queue [s].
-            for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+            for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
@@ -365,7 +366,7 @@ class Drone:
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples for other consumers are returned, too.
+            max_hz: As for :meth:`feedback`; samples requested by other consumers are returned, too.
 
         Raises:
             NoAnswerError: If none arrives in time.
@@ -403,18 +404,18 @@ class Drone:
             The feedback that met the condition.
 
         Raises:
-            NoAnswerError: If it is not met in time; the text has the current state.
+            NoAnswerError: If it is not met in time; the message gives the current state.
             UnknownNameError: If there is no flight state of this name.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
     async def overview(self, timeout_s: float = 2.0) -> Overview:
-        """Return the newest overview of all vehicles in the proxy's process, with one row each.
+        """Return the newest overview of all vehicles in the proxy's process, with one row per vehicle.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        It is sent once a second and is much smaller than feedback, for applications that watch many vehicles. The first
-        call subscribes permanently and waits for one.
+        Overviews are sent once a second and are much smaller than feedback, which helps applications that watch many
+        vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
             timeout_s: How long to wait for the first one [s].
@@ -422,7 +423,7 @@ class Drone:
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
             ClosedError: If the drone is closed.
-            UsageError: If called from an inline callback before there is one.
+            UsageError: If called from an inline callback before the first one has arrived.
         """
     @property
     def name(self) -> str:
@@ -441,9 +442,9 @@ class Drone:
         """Current state of this application's authority."""
     @property
     def link(self) -> LinkStatus:
-        """State of both hops, application to proxy and proxy to vehicle.
+        """State of both hops: application to proxy, and proxy to vehicle.
 
-        ``reason`` belongs to the last change or, while the proxy is lost, to the last failed attempt to reconnect.
+        ``reason`` explains the last change or, while the proxy is lost, the last failed attempt to reconnect.
         """
     @property
     def closed(self) -> bool:
@@ -459,13 +460,13 @@ class Drone:
         """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
     @property
     def start_position(self) -> Vector | None:
-        """Where the vehicle last took off, east, north, up in world axes [m]; None if unknown."""
+        """Position of the last take-off in world axes: east, north, up [m]; None if unknown."""
     def age_s(self, sample: Feedback | Frame) -> float:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
     def recent_events(self) -> list[Event]:
         """Return the last 256 events, oldest first."""
     def hover(self) -> bool:
-        """Stop and hold the position. Returns and raises as all commands do; see :class:`Drone`."""
+        """Stop and hold the position. Return values and exceptions are those of all commands; see :class:`Drone`."""
     def idle(self) -> bool:
         """Keep the authority and leave the vehicle as it is."""
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
@@ -478,7 +479,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
@@ -490,19 +491,19 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle shows it
-        (``FlightState.EMERGENCY``), or for 8 s; then it is abandoned with an event (``vehicle_message``, reason
+        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle reports it
+        (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
         connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
-            False if the link is down, so that it can't be sent now.
+            False if the link is down and the stop can't be sent now.
 
         Raises:
             AuthorityError: If this application only observes.
@@ -512,13 +513,13 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If a stop of this application has not shown yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
         """
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
     def send_external_pose(
         self,
@@ -529,7 +530,7 @@ class Drone:
         position_std_m: float | None = None,
         attitude_std_rad: float | None = None,
     ) -> bool:
-        """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
+        """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
 
         Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
 
@@ -553,7 +554,7 @@ class Drone:
 
         Args:
             kind: Kind of the event.
-            text: Text for people.
+            text: Human-readable text.
             severity: Severity of the event.
             **data: Details, by name.
         """
@@ -563,25 +564,25 @@ class Drone:
         Args:
             frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the part that drew them; None: this application. Only the newest per source and camera
-                counts.
+            source: Name of the component that drew them; None: this application. For each source and camera, new shapes
+                replace earlier ones.
 
         Returns:
             True if they were handed to the transport.
 
         Raises:
-            UsageError: If something is not a shape, there are too many, coordinates are not finite, or colours are not
+            UsageError: If an item is not a shape, there are too many, coordinates are not finite, or colours are not
                 within 0 to 255.
         """
     def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback.
 
-        An observer gets the least data that satisfy all its consumers, and complete samples while no consumer limits
-        its request; the first call of this method adds a permanent consumer. A pilot always gets everything.
+        An observer receives only as much data as its consumers need, and every sample as long as none of them limits
+        its request; the first call of this method adds a permanent consumer. A pilot always receives everything.
 
         Args:
             max_age_s: Maximum age since capture [s]; None: any.
-            max_hz: Sufficient rate of new samples, 0.001 to 1000 Hz; None: all.
+            max_hz: Maximum rate of new samples that is needed, 0.001 to 1000 Hz; None: all.
 
         Raises:
             NoAnswerError: If there is no feedback yet, or the newest is older than ``max_age_s``.
@@ -661,18 +662,18 @@ class Drone:
     ) -> client.Listener[EncodedFrame]:
         """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
-        Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing picture, the next one is a key picture, requested from the proxy. Without
-        ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
-        encoded by the proxy at the rate that the path carries.
+        Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
+        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
+        ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it doesn't send H.264, encoded by
+        the proxy at the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate of an encoding by the proxy, shared by all who request the same [kbit/s].
+            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
             max_fps: Maximum pictures per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; beyond that, some are lost.
+            depth: How many pictures may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Returns:
@@ -745,7 +746,7 @@ class Drone:
                 them.
         """
     def on_link(self, function: Callable[[LinkStatus], object | Awaitable[object]]) -> Listener:
-        """Call ``function``, on the event loop, whenever one of the two hops changes its state; up to 256 wait.
+        """Call ``function``, on the event loop, whenever one of the two hops changes state; up to 256 changes wait.
 
         ``function``, plain or a coroutine function, runs on the event loop.
         """
@@ -796,8 +797,8 @@ class Drone:
         Args:
             function: Called on the event loop.
             processor: Name of the processor; None: all processors.
-            max_age_s: Results older than this when their turn comes are skipped, and counted in the listener's
-                ``expired`` [s]; None: none are.
+            max_age_s: Maximum age [s]; results older than this when their turn comes are skipped and counted in the
+                listener's ``expired``. None: no limit.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
@@ -831,7 +832,7 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may demand a landing. Only one
+    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
     task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
@@ -856,7 +857,7 @@ class Swarm:
 
         Args:
             function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
-            what: Name of the action in error messages; empty: the function's.
+            what: Name of the action in error messages; empty: the function's name.
 
         Returns:
             Its results, by name.
@@ -865,8 +866,8 @@ class Swarm:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
         Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
-        ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by its velocities or attitudes hover at
-        once, because nothing would give them newer ones.
+        ends, by its time, a ``break``, an exception or Ctrl-C, drones still flying its velocities or attitudes hover at
+        once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
@@ -890,7 +891,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
@@ -903,7 +904,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def go_to(
@@ -923,16 +924,16 @@ class Swarm:
         paths. Drones that are set aside are left out.
 
         Args:
-            places: By name of the drone: x, y, z in its world axes [m], and optionally the yaw [rad].
+            places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
             speed: Maximum speed on the way [m/s]; None: as fast as the limits allow.
-            wait: Wait until each is there; otherwise only send the commands.
+            wait: Wait until each drone has arrived; otherwise only send the commands.
             timeout_s: How long to wait [s].
-            tolerance_m: Distance from the position that counts as there [m].
+            tolerance_m: Maximum distance from the position at arrival [m].
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
-            UsageError: If a position is invalid; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
+            UsageError: If a position is invalid; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def return_to_start(
@@ -951,8 +952,8 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            UsageError: If an argument makes no sense; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UsageError: If an argument makes no sense; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def hover(self) -> dict[str, bool]:
@@ -960,7 +961,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that others fly are left to them: only a drone's own ``drones[name].hover()`` takes it back.
+        Drones flown by other applications are left alone; only a drone's own ``drones[name].hover()`` takes it back.
         """
     async def idle(self) -> dict[str, bool]:
         """Keep the authority and leave the vehicles as they are.
@@ -1008,8 +1009,8 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
-        the time between the first and the last command.
+        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        :attr:`spread` is the time between the first and the last command.
 
         Args:
             actions: Actions by name of the drone.
@@ -1018,9 +1019,9 @@ class Swarm:
             By name, True if the command was handed to the transport.
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
-            UsageError: If an action can't be commanded or has numbers that are not finite; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
+            UsageError: If an action can't be commanded or has non-finite numbers; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def request_authority(
@@ -1037,7 +1038,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
             wait_s: As for :meth:`Drone.request_authority`.
             for_s: As for :meth:`Drone.request_authority`.
             takeover: As for :meth:`Drone.request_authority`.
@@ -1060,7 +1061,7 @@ class Swarm:
             max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
@@ -1079,7 +1080,7 @@ class Swarm:
 
         Raises:
             UnknownNameError: If there is no flight state of this name.
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
     @property
@@ -1087,12 +1088,12 @@ class Swarm:
         """Names of all drones, including those set aside."""
     @property
     def errors(self) -> dict[str, Exception]:
-        """Reasons of drones that do not take part, by name: those set aside, and those never connected."""
+        """Why drones do not take part, by name: those set aside and those that never connected."""
     def readmit(self, *names: str) -> None:
         """Reactivate drones that were set aside.
 
         Args:
-            *names: Names of the drones; none: all.
+            *names: Names of the drones; all of them if none is given.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names.
@@ -1125,26 +1126,26 @@ def connect(
 
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
-    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s``, or 60 s,
-    it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
+    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
-            For an address, a private proxy starts, which ends with the drone and with this process. A name is looked
-            up on this host first and then, if ``network`` allows it, on the network.
+            For an address, a private proxy is started; it ends with the drone, or with this process. A name is looked
+            up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to wake up [s]; None or 0: 5 s for a name and 20 s for
+        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
             an address, and then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
             others fly is left alone, with a warning in the log.
-        authority: How a pilot requests the authority: priority, waiting, asking its holder first. None:
-            ``Authority()``.
+        authority: How a pilot requests the authority: its priority, how long it waits, whether it asks the holder
+            first. None: ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: the value of the
-            variable ``SKYLOOP_NETWORK``; without one, this host only.
+            variable ``SKYLOOP_NETWORK`` or, if it is not set, this host only.
 
     Raises:
         UnknownNameError: If no proxy of this name is running; carries suggestions.
@@ -1167,9 +1168,9 @@ def swarm(
         *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
-        on_error: Policy for the others when one fails; see :class:`Swarm`.
-        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
-            none is left.
+        on_error: What the others do when a drone fails; see :class:`Swarm`.
+        missing: How to handle drones that can't be connected: ``"raise"`` fails the call, ``"skip"`` leaves them out
+            as long as at least one drone connects.
         **options: As for :func:`skyloop.connect`, for each drone.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The asyncio API of drones and swarms: tables of members that forward to the synchronous classes, and the rest."""
+"""The asyncio API for drones and swarms: tables of members forwarded to the synchronous classes, and the rest."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ class LoopNotifier(Notifier):
 
 
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
-    """Run a blocking function in its own thread: a thread pool could be full when the vehicle has to land.
+    """Run a blocking function in its own thread, because a thread pool could be full when the vehicle has to land.
 
-    If the caller is cancelled, a wait for a command ends (see :data:`skyloop.client.commands.cancelled`), and
+    If the caller is cancelled, waiting for a command ends (see :data:`skyloop.client.commands.cancelled`), and
     ``abandoned`` is called with the unclaimed result.
     """
     loop = asyncio.get_running_loop()
@@ -73,7 +73,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
-    outside = cancelled.get()  # the cancellation of an outer thread that waits for this coroutine
+    outside = cancelled.get()  # whether an outer thread that waits for this coroutine was cancelled
 
     def work() -> None:
         result, error = None, None
@@ -92,7 +92,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
     try:
         return await future
     except asyncio.CancelledError:
-        # Cancelled in the same round of the event loop as the result arrived: no one else will see it.
+        # Cancelled in the same iteration of the event loop in which the result arrived, which nothing else will see.
         if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
             threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
         raise
@@ -116,7 +116,7 @@ def from_thread(function: Callback[T]) -> Callable[[T], Any]:
 
 
 def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
-    """Decorate an asyncio class with members of ``kind``: each way to make one has a row of names."""
+    """Decorate an asyncio class with members of ``kind``, made in different ways, each of which has a row of names."""
 
     def fill(face: type[T]) -> type[T]:
         for way, names in rows.items():
@@ -163,7 +163,7 @@ def on_loop(member: Any) -> Any:
 
 
 def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Callable[..., Opening[Opened]]:
-    """Turn a synchronous connect function into one whose result is awaited, or entered."""
+    """Turn a synchronous connect function into one whose result is awaited or entered as a context manager."""
 
     @wraps(function)
     def call(*targets: Any, **options: Any) -> Opening[Opened]:
@@ -174,7 +174,7 @@ def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Calla
 
 
 def like(member: Any, text: str = "") -> Callable[[T], T]:
-    """Give a hand-written method its counterpart's docstring, with one more paragraph."""
+    """Give a hand-written method the docstring of its counterpart, with an additional paragraph."""
 
     def explain(function: T) -> T:
         function.__doc__ = member.__doc__
@@ -209,7 +209,7 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
     own: Any = made
     own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
     own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
-    del own.__wrapped__  # its annotations would be read instead
+    del own.__wrapped__  # otherwise its annotations would be used
     return made
 
 
@@ -220,7 +220,7 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
 class Config:
     """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
 
-    Writing needs the authority. See :class:`skyloop.client.Config` for how written values are kept.
+    Writing needs the authority. :class:`skyloop.client.Config` explains how written values are kept.
     """
 
     sync: client.Config  #: the wrapped parameters
@@ -294,7 +294,7 @@ class Drone:
 
     @property
     def log(self) -> client.Logbook:
-        """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
+        """Publishes text and numbers during the flight; see :class:`skyloop.client.Logbook`."""
         return self.sync.log
 
     @like(client.Drone.frames, "A JPEG is decoded on another thread, while :meth:`frame` decodes on the event loop.")
@@ -350,7 +350,7 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may demand a landing. Only one
+    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
     task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
@@ -390,7 +390,7 @@ class Swarm:
 
         Args:
             function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
-            what: Name of the action in error messages; empty: the function's.
+            what: Name of the action in error messages; empty: the function's name.
 
         Returns:
             Its results, by name.
@@ -412,7 +412,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # after a cancellation they would keep flying, against the next commands
+        finally:  # otherwise they would keep commanding after a cancellation, in conflict with the next commands
             over = True
             for waiting in begun:
                 waiting.cancel()
@@ -457,7 +457,7 @@ class Opening(Generic[Opened]):
 
 
 def _reject_in_step(target: object) -> None:
-    """Raise for a stepped replay, whose time would never advance here."""
+    """Raise an error for a stepped replay, whose time would never advance here."""
     if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
         raise UsageError(
             f"{target}: speed=max advances only while a thread waits, which an event loop never does: use "

@@ -1,7 +1,7 @@
-"""Actions of an application: checks of their numbers, completion, and the schedule of sending them. Pure.
+"""An application's actions: how their numbers are checked, when they are complete and when they are sent. Pure.
 
 The newest set-point wins: it is sent at once and then repeated at a steady rate on absolute deadlines, unless a newer
-one comes within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
+one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
 leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
 """
 
@@ -40,12 +40,12 @@ from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle slower than this at its target has arrived
 _ACTIONS: Final = frozenset(ACTION_NAMES)
-_OLD_PLACE_S: Final = 2.0  #: older feedback is not used to convert a place on the earth
-OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be requested again
-OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: ended by the application itself
+_OLD_PLACE_S: Final = 2.0  #: maximum age of feedback used to convert a geographic position
+OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the action may be requested again
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: fates of actions that the application itself ended
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
-#: States that complete an action, for proxies that report no outcome; after that, it is no longer sent.
+#: States that complete an action if the proxy reports no outcome; a complete action is no longer sent.
 _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
     Land: frozenset({FlightState.LANDED}),
@@ -53,7 +53,7 @@ _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     ReturnToStart: frozenset({FlightState.LANDED}),
     ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
 }
-#: Minimum time of repeating such an action, because the known state may be from before the command.
+#: Minimum time for which these actions are repeated, because the known state may predate the command.
 _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(0.3),
     Land: nanoseconds(0.3),
@@ -63,12 +63,12 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s and reports whether it may be requested again
-    Land: nanoseconds(60.0),  # since the proxy last reported it as in progress
+    Land: nanoseconds(60.0),  # counted from the proxy's last report that it is in progress
     EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
-_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent within this time is not sent later
-_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: period of a stop's repeats, whatever the rate of other commands
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval at which a stop is repeated, whatever the rate of other commands
 
 
 def checked(action: AnyAction) -> AnyAction:
@@ -91,8 +91,8 @@ def checked(action: AnyAction) -> AnyAction:
 def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
     """Return the action that flies to a target: x east, y north, z up [m], yaw from x [rad], maximum speed [m/s].
 
-    None keeps the current yaw, and flies as fast as the limits allow. Raises :class:`UsageError` for values that are
-    not numbers, not finite, or make no sense.
+    If ``yaw`` is None, the current yaw is kept; if ``speed`` is None, only the limits apply. Raises :class:`UsageError`
+    for values that are not numbers, not finite, or make no sense.
     """
     place = Position(
         number("x", x),
@@ -106,7 +106,7 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start; None: the proxy's parameters decide.
+    """Return the action that flies back to the start; for None, the proxy's parameters decide.
 
     Raises :class:`UsageError` if a value is not a number or bool, or makes no sense.
     """
@@ -123,17 +123,17 @@ def in_world_axes(
     newest: Feedback | None,
     age_s: float,
 ) -> tuple[object, object, object]:
-    """Return x, y, z [m] of a target given in either form; the values of the other form are None.
+    """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
 
     Args:
         local: x, y, z in world axes [m].
-        earth: Latitude and longitude [°], altitude above mean sea level [m] or None: the current height.
+        earth: Latitude and longitude [°], and altitude above mean sea level [m]; None: the current height.
         newest: The newest feedback.
         age_s: Its age [s].
 
     Raises:
         UsageError: If both forms or neither are given, or a value is not a number or not on the earth.
-        RefusedError: If the vehicle's place on the earth is unknown.
+        RefusedError: If the vehicle's geographic position is unknown.
     """
     if all(one is None for one in earth):
         if any(one is None for one in local):
@@ -182,7 +182,7 @@ def number(name: str, value: object) -> float:
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
     """Return whether a vehicle is in the air at a target, and nearly at rest.
 
-    The yaw counts if the target has one; a vehicle that reports no velocity counts as at rest.
+    The yaw is checked if the target has one; a vehicle that doesn't report its velocity is assumed to be at rest.
     """
     if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False
@@ -194,7 +194,7 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
 
 
 class ReturnWatch:
-    """Decides whether a return is over; called with each newest feedback."""
+    """Decides whether a return is over. Call it with each new sample of feedback."""
 
     def __init__(self) -> None:
         """Start before the command is sent."""
@@ -229,7 +229,7 @@ class CommandSchedule:
             stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
                 Flights to a target and returns do not decay: the vehicle stops there.
             min_interval_s: Minimum time between two set-points of the application [s], not counting repeats.
-            keep_s: Maximum age of a set-point from a time without a link to be sent when the link is back [s].
+            keep_s: Maximum age at which a set-point commanded without a link is still sent once the link is back [s].
 
         Raises:
             UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
@@ -252,9 +252,9 @@ class CommandSchedule:
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
         # period longer, and only the application's commands delay the next one.
         self._first_ns = self._period_ns * 5 // 4
-        self._new_sent_ns = -self._min_interval_ns  # when the newest intent was first sent
+        self._new_sent_ns = -self._min_interval_ns  # time at which the newest intent was first sent
         self._sent_intent = 0
-        self.due_ns = 0  #: when :meth:`next` has something to send
+        self.due_ns = 0  #: time from which :meth:`next` has something to send
         self._failsafe = Failsafe.NONE
         self._reset_asked_ns: int | None = None  # during a stop
 
@@ -273,7 +273,7 @@ class CommandSchedule:
         self.latest[type(action)] = self.intent
         self.automatic = automatic
         self._asked_ns = now_ns
-        if stops or type(action) in _DONE_IN:  # rare and important: at once
+        if stops or type(action) in _DONE_IN:  # rare and important, so send it at once
             self.due_ns = now_ns
         else:
             self.due_ns = max(now_ns, self._new_sent_ns + self._min_interval_ns)
@@ -287,9 +287,9 @@ class CommandSchedule:
     def may_ask(self, action: AnyAction) -> bool:
         """Return whether the application may command this now.
 
-        An emergency stop is repeated until the vehicle shows it, or for 8 s. Until then, nothing else of this
-        application is sent, or a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
-        that was never sent. A reset is sent once the stop has shown, if that is soon.
+        An emergency stop is repeated until the vehicle reports it, or for 8 s. Until then, this application sends
+        nothing else; otherwise a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
+        that was never sent. A reset is sent once the vehicle has reported the stop, if it does so soon.
         """
         if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
@@ -325,7 +325,7 @@ class CommandSchedule:
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Note that the result of :meth:`next` could not be sent. Later set-points replace it, but not a landing."""
+        """Record that the result of :meth:`next` was not sent. A later set-point replaces it unless it is a landing."""
         if isinstance(action, EmergencyStop):
             if self._new_sent_ns == now_ns:  # its first attempt: it may still be withdrawn, and is abandoned soon
                 self._sent_intent = -1
@@ -333,7 +333,7 @@ class CommandSchedule:
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if it must be sent before ``action``, which neither repeats nor revokes it.
+        """Return :attr:`owed` if ``action`` neither repeats nor revokes it, so that it must be sent first.
 
         The library's own actions revoke everything except a landing.
         """
@@ -345,7 +345,7 @@ class CommandSchedule:
         return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
-        """Return whether the set-point ``before`` has decayed to hover for lack of calls by the application."""
+        """Return whether the set-point ``before`` has decayed to hover because the application made no calls."""
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
@@ -361,7 +361,7 @@ class CommandSchedule:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
         elif (
-            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; anyone may stop
+            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; any pilot may stop
             and feedback.state in done_in
             and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         ):
@@ -374,7 +374,7 @@ class CommandSchedule:
                 self.clear(Fate.FAILSAFE)
 
     def clear(self, fate: Fate) -> None:
-        """Drop the set-point, ended here by ``fate``. An emergency stop stays."""
+        """Drop the set-point, and record ``fate`` as the reason. An emergency stop is kept."""
         self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
         self.owed = None
 
@@ -385,7 +385,7 @@ class CommandSchedule:
             self.action = _IDLE
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
-        """Resume sending, on the connection made at ``connected_ns``: drop a set-point that is too old."""
+        """Resume sending on the connection made at ``connected_ns``, without a set-point that is too old."""
         if now_ns - self._asked_ns > self._keep_ns:  # on this connection, only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE

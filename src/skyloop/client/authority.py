@@ -1,4 +1,4 @@
-"""This application's knowledge of its authority, from replies, events and feedback, and requests to hand it over.
+"""Track this application's authority by replies, events and feedback, and answer requests to hand it over.
 
 Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow with each grant.
 """
@@ -37,7 +37,7 @@ class Authority:
     Attributes:
         priority: 0 (highest) to 31 (lowest); a higher priority pre-empts a lower one.
         wait_s: How long to wait in the queue while another application holds the authority [s].
-        for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+        for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
         takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
         stay: Whether to stay in the queue after ``wait_s``, without the authority, rather than fail.
 
@@ -71,7 +71,7 @@ class AuthorityStatus:
             ``preempted``: taken over by another application; waiting in the queue to get it back.
         lease: Number of the lease while held, otherwise 0.
         priority: Priority of the last request, 0 (highest) to 31.
-        holder: Name of the application that holds it; None if there is none or it is unknown.
+        holder: Name of the application that holds the authority; None if there is none or it is unknown.
         position: Position in the queue, 1 being next; 0 if unknown.
         expected_wait_s: Wait if all those ahead in the queue keep to their announced times [s]; None if unknown.
         until_ns: End of the time that this application requested, on the proxy's clock; None: unlimited.
@@ -89,7 +89,7 @@ class AuthorityStatus:
 class EndedSessions:
     """Ended sessions of this process, by run of the proxy and number of the application. Thread-safe.
 
-    A proxy may notice the end after the start of the next session, and until then the old one holds the authority.
+    A proxy may not notice that a session has ended before the next one begins; until then, it still has the authority.
     """
 
     MOST = 256  #: number of remembered sessions
@@ -112,7 +112,7 @@ class EndedSessions:
 class AuthorityTracker:
     """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
-    #: How long feedback without an owner may be older than the grant.
+    #: For this long after a grant, feedback without an owner may predate it.
     SETTLE_NS = nanoseconds(0.5)
 
     def __init__(self, name: str, ended: EndedSessions | None = None) -> None:
@@ -122,9 +122,9 @@ class AuthorityTracker:
         self._owner_id = 0  # the owner in the last feedback; 0: none
         self.app_id = 0
         self.wanted = False  #: the application requested it and has not released it
-        self.pending = False  #: requested on this connection, without an answer yet
+        self.pending = False  #: requested on this connection, but not answered yet
         self.status = AuthorityStatus()
-        self.last_request = RequestAuthority()  #: the last request, which is repeated on another connection
+        self.last_request = RequestAuthority()  #: the last request, which is repeated on a new connection
         self.declined = ""  #: why the holder declined
         #: Whether to request it again automatically after a lost connection, or after losing the lease by silence.
         self.renews = True
@@ -138,17 +138,17 @@ class AuthorityTracker:
 
     @property
     def awaited(self) -> bool:
-        """Whether it is requested, and nothing shows yet that another application holds it."""
+        """Whether it is requested and, as far as is known, held by no other application."""
         return self.wanted and (self.status.state == "none" or not self.settled)
 
     @property
     def answered(self) -> bool:
-        """Whether it is held, queued for, or no longer wanted. A lost link is not an answer."""
+        """Whether it is held, queued for, or no longer wanted. A lost link does not count as an answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)
 
     @property
     def behind_itself(self) -> bool:
-        """Whether it only waits for the proxy to notice the end of an earlier session of this process."""
+        """Whether it is only waiting for the proxy to notice that an earlier session of this process has ended."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
@@ -157,14 +157,14 @@ class AuthorityTracker:
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection, which invalidates older leases and, in another run, numbers of applications."""
+        """Reset on a new connection; older leases are invalid and, in another run, so are application numbers."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """Note a lost connection, which ends the authority; it stays wanted if it is to be renewed."""
+        """Handle a lost connection, which ends the authority; it stays wanted if it is to be renewed."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False
@@ -172,33 +172,33 @@ class AuthorityTracker:
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
     def asked(self, request: RequestAuthority) -> None:
-        """Note that the authority is being requested."""
+        """Record that the authority is being requested."""
         self.wanted = self.pending = True
         self.last_request = request
         self.declined = ""
         self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """Note a grant from a reply, an event or feedback; ignore one that has been lost since.
+        """Record a grant from a reply, an event or feedback; ignore one that has been lost since.
 
         ``until_ns``: the end of its time, on the proxy's clock; None: unlimited, or known from before.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
-            return False  # an old lease, reported late: it has been lost since
+            return False  # the late report of an old lease, which has been lost since
         if until_ns is None and lease == self._lease:
             until_ns = self.status.until_ns  # feedback and some events do not repeat it
         self._lease, self._granted_ns = lease, now_ns
         return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
     def queued(self, position: int, holder: str, expected_wait_s: float | None = None) -> bool:
-        """Note the position in the queue; see :class:`AuthorityStatus`."""
+        """Record the position in the queue; see :class:`AuthorityStatus`."""
         self.pending = False
         state: AuthorityState = "preempted" if self.status.state == "preempted" else "queued"
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
 
     def given_back(self) -> bool:
-        """Note that it was released by the application, or refused: neither granted nor queued."""
+        """Record that the application has released it, or that the proxy has refused it."""
         self.wanted = self.pending = False
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
@@ -221,7 +221,7 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # its time is over: not requested again automatically
+            if data.get("reason") == "expired":  # its time is over, so it is not requested again automatically
                 return self.given_back()
             return self._lost(None)
         return False
@@ -247,7 +247,7 @@ class AuthorityTracker:
         return False
 
     def _lost(self, holder: str | None) -> bool:
-        """Note that ``holder`` took it over, or that the proxy ended it because this application was silent."""
+        """Record that ``holder`` took it over, or that the proxy ended it because this application was silent."""
         if not holder and not self.renews:
             return self.given_back()
         state: AuthorityState = "preempted" if holder else "none"
@@ -262,7 +262,7 @@ def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
 
 
-#: True: hand it over; False, or a reason as text: decline; None: leave it to the proxy.
+#: True hands it over; False, or a reason as text, declines; None leaves the decision to the proxy.
 TakeoverAnswer = bool | str | None
 
 
@@ -272,13 +272,13 @@ class TakeoverRequest:
 
     by: str  #: name of the other application
     priority: int  #: 0 is the highest
-    within_s: float  #: after this time it wins if its priority is strictly higher
+    within_s: float  #: after this time [s], it wins if its priority is strictly higher
     for_s: float | None  #: how long it wants to hold the authority; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuery:
-    """A request as received, with the data for an answer."""
+    """A request as received, with the data needed to answer it."""
 
     request: TakeoverRequest
     lease: int  #: the lease to give up

@@ -39,18 +39,19 @@ _log = logging.getLogger("skyloop")
 
 
 class Channel(Generic[T]):
-    """One kind of sample, delivered to every consumer on the thread on which it arrives."""
+    """Delivers one kind of sample to every consumer, on the thread on which it arrives."""
 
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
         """Create a channel without consumers.
 
-        ``subscribe`` is called with whether samples are needed, whenever that changes, under the channel's lock.
+        Whenever samples begin or cease to be needed, ``subscribe`` is called with True or False, under the channel's
+        lock.
         """
-        self.subscribed = False  #: whether samples are needed: there is a consumer, or the channel is kept
+        self.subscribed = False  #: whether samples are needed, because there is a consumer or the channel is kept
         self.kept = False  #: subscribed permanently, by :meth:`keep`
         self._consumers: tuple[Callable[[T], None], ...] = ()
         self._drops: dict[Callable[[T], None], Callable[[], int]] = {}
-        self._dropped_before = 0  # by removed consumers
+        self._dropped_before = 0  # samples missed by consumers that have been removed
         self._lock = threading.Lock()
         self._subscribe = subscribe
 
@@ -94,7 +95,7 @@ class Channel(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Samples that consumers missed, including removed ones."""
+        """Samples that consumers missed, including consumers that have been removed."""
         with self._lock:
             return self._dropped_before + sum(dropped() for dropped in self._drops.values())
 
@@ -113,13 +114,13 @@ class Channel(Generic[T]):
 
 
 class FollowingChannel(Channel[T], Generic[T, C]):
-    """A channel that changes with the proxy's cameras: after a restart with other cameras, it finds another one.
+    """A channel that switches to another camera's channel if the proxy restarts with other cameras.
 
-    Callers that name no camera follow the vehicle's first. Consumers are added to the channel found.
+    It serves callers that name no camera, and so use the vehicle's first. Consumers are added to the current channel.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Start with the result of ``find``; call it again with each sample of ``changes``, unless it raises."""
+        """Start with the result of ``find``, called again for each sample of ``changes``; later errors are ignored."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -158,9 +159,9 @@ class Listener(Generic[T]):
     """An application's callback, called with samples until :meth:`cancel` or the end of its block.
 
     The function has its own thread and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
-    samples and delays no one else. With ``inline=True`` it is called on the receiving thread, before the next sample is
-    received, which is fastest; it must be quick and must not wait. Its exceptions are counted and, at most once a
-    second, logged and emitted as an event; the function is called again with the next sample.
+    samples and delays no other consumer. With ``inline=True`` it is called on the receiving thread, before the next
+    sample is received, which is fastest; it must be quick and must not wait. Its exceptions are counted and, at most
+    once a second, logged and emitted as an event; the function is called again with the next sample.
     """
 
     def __init__(
@@ -182,7 +183,7 @@ class Listener(Generic[T]):
             report: Called with this listener's name and each exception of ``function``.
             name: Name for the thread and for error messages.
             depth: How many samples may wait.
-            inline: Call on the publishing thread instead of an own one.
+            inline: Call the function on the publishing thread instead of its own.
             on_cancel: Called with this listener when it is cancelled.
         """
         self.name = name
@@ -214,7 +215,7 @@ class Listener(Generic[T]):
         """Stop calling the function. Idempotent.
 
         Args:
-            wait: Wait for a running call, at most 2 s; not if called from the function itself.
+            wait: Wait up to 2 s for a call in progress; ignored if called from the function itself.
         """
         self._channel.remove(self._consumer)
         self._mailbox.close()
@@ -224,7 +225,7 @@ class Listener(Generic[T]):
             self.join(JOIN_S)
 
     def join(self, within_s: float) -> None:
-        """Wait for a running call; not if called from the function itself."""
+        """Wait for a call in progress; return at once if called from the function itself."""
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
             thread.join(within_s)
@@ -250,7 +251,7 @@ class Listener(Generic[T]):
             self._function(sample)
         except ClosedError:  # the drone was closed, or its flight ended: not an error of the function
             self.errors += 1
-        except SystemExit as error:  # would end only this thread, unnoticed
+        except SystemExit as error:  # it would end only this thread, unnoticed
             self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
@@ -279,7 +280,7 @@ class Holder(Protocol[T_contra]):
 class Mailbox(Generic[T]):
     """Keeps the newest ``depth`` items until its consumer takes them, and counts the dropped ones.
 
-    Any number of threads put, one takes.
+    Any number of threads may put items; one thread takes them.
     """
 
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
@@ -326,7 +327,7 @@ class Mailbox(Generic[T]):
             return self._items[0] if self._items else None
 
     def wait(self, timeout_s: float | None = None) -> T | None:
-        """Take an item, waiting for one (without limit for None); None after the time-out, or once closed."""
+        """Wait for an item (without limit for None) and take it; return None after the time-out, or once closed."""
         self.notifier.wait_for(lambda: bool(self._items) or self.closed, timeout_s)
         return None if self.closed else self.take()
 
@@ -342,7 +343,7 @@ class Mailbox(Generic[T]):
 class Notifier:
     """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
 
-    Each waiting thread brings its own lock, and checks its condition once more after adding it. So no notification is
+    Each waiting thread adds its own lock, and then checks its condition once more. This way no notification is
     missed, and the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
@@ -364,7 +365,7 @@ class Notifier:
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until ``ready()`` is true (without limit for None); return whether it became true in time.
 
-        It is checked on this thread, first and after each notification.
+        ``ready`` is called on this thread, first at once and then after each notification.
         """
         if ready():
             return True

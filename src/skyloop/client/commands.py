@@ -1,4 +1,4 @@
-"""The authority and the commands of one application, over any connection."""
+"""One application's authority and commands, over any connection."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: How long to wait for the proxy to notice the end of an earlier session of this process: more than its lease's
-#: time-out.
+#: How long to wait for the proxy to notice the end of an earlier session of this process; this exceeds the time-out
+#: of that session's lease.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
-#: Requests of an application that no automatic hover of the library may end.
+#: An application's requests that an automatic hover by the library must not end.
 LANDING: Final = (Land, EmergencyStop)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: unknown to older proxies
-_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: after this end, the next set-point is most likely refused, too
-#: Actions that programs send continuously: a single unsent one is not an error.
+_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: fates after which the next set-point is most likely refused, too
+#: Actions that programs send continuously; failing to send one of them is not an error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
-_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: not sent for a caller that has stopped waiting
+_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: not sent once the caller has stopped waiting
 #: Whether the caller of the current thread or task has stopped waiting; set for threads that wait on another's behalf.
 cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
 
@@ -79,7 +79,7 @@ class GivenUpError(Exception):
 class CommandSender:
     """Requests and keeps the authority, and sends the newest command at once and then at a steady rate.
 
-    No other object changes its ``authority``.
+    Its ``authority`` is changed by no other object.
     """
 
     def __init__(
@@ -107,18 +107,18 @@ class CommandSender:
         self._emit = emit
         self._changed = changed
         self._granted = granted
-        self._lock = threading.Lock()  # guards everything below; never held while waiting or in a callback
+        self._lock = threading.Lock()  # guards everything below; never held during a wait or a callback
         self._seq = 0
         self._connected_ns = 0  # start of the current connection
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
-        self.barred = False  #: the flight is ending: only the library's own commands and an emergency stop pass
+        self.barred = False  #: the flight is ending, so only the library's own commands and an emergency stop are sent
         self._impossible: dict[type, str] = {}  # reasons for what neither vehicle nor proxy supports
         self.told: Outcome | None = None  #: the proxy's newest report on this application's intents
-        self._first_set_point = 0  # first number in the current series of set-points; 0: there is none
+        self._first_set_point = 0  # number of the first in the current series of set-points; 0: there is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
-        self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
+        self.sends = ChannelCounter()  #: counts commands sent; ``dropped``: those that were not handed to the transport
 
     @property
     def status(self) -> AuthorityStatus:
@@ -155,7 +155,7 @@ class CommandSender:
         return self._schedule.wants_flight
 
     def bar(self) -> None:
-        """Bar all commands of the application except an emergency stop; when this returns, none is on its way."""
+        """Bar the application's commands except an emergency stop; once this returns, none is still being sent."""
         with self._lock:
             self.barred = True
 
@@ -167,14 +167,14 @@ class CommandSender:
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
-        After a lost connection or lease, the authority is no longer requested again automatically, but by that person.
+        After a lost connection or lease, only that person requests the authority again; nothing does so automatically.
         """
         with self._lock:
             self._authority.renews = False
             self._present_until_ns = self._clock()
 
     def present_until(self, until_ns: int) -> None:
-        """Extend the time until which the person who flies is known to be present; never shortens it.
+        """Extend the time until which the person flying is known to be present; never shortens it.
 
         After that time, nothing is repeated, nothing new is flown and no authority is requested, so that the proxy
         considers the pilot silent. Commands that end a flight are still sent once, and emergency stops as always. The
@@ -187,7 +187,7 @@ class CommandSender:
             absent, schedule = known_ns < self._clock(), self._schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
             ends = kind is Land or (kind is Hover and not schedule.automatic)  # by a person, who may be waiting for it
-            if absent and not ends:  # later signs of life must not revive an old set-point
+            if absent and not ends:  # an old set-point must not be revived when the person returns
                 schedule.clear(Fate.WITHDRAWN)
                 if kind in (Velocity, Attitude):
                     schedule.ask(Hover(), self._clock(), automatic=True)
@@ -195,7 +195,7 @@ class CommandSender:
             self._connection.poke()
 
     def is_present(self, now_ns: int) -> bool:
-        """Return whether the person who flies is known to be present; always True unless one is required."""
+        """Return whether the person flying is known to be present; always True unless presence is required."""
         return self._present_until_ns is None or now_ns <= self._present_until_ns
 
     # For the application ---------------------------------------------------------------------------------------
@@ -205,8 +205,8 @@ class CommandSender:
 
         Args:
             action: The action.
-            now: Raise if it can't be sent at once. Only a landing is then still sent later.
-            automatic: The library's own action: the proxy takes no vehicle from others for it. Passes :meth:`bar`.
+            now: Raise if it can't be sent at once; in that case only a landing is still sent later.
+            automatic: Whether it is the library's own: never takes a vehicle from others, and passes :meth:`bar`.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.
@@ -218,7 +218,7 @@ class CommandSender:
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
-            # A new series of set-points starts after any other command: a refusal from before says nothing about it.
+            # A new series of set-points starts after any other command: an earlier refusal says nothing about it.
             self._first_set_point = 0
             return sent
         told = self.told
@@ -229,7 +229,7 @@ class CommandSender:
         """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
         :meth:`outcome` returns its outcome. ``again`` is the intent that it repeats under a new number; if another
-        command was given since, nothing is sent and the number stays.
+        command has been given since, nothing is sent and the number stays the same.
         """
         return self._put(action, automatic=automatic, again=again)[0]
 
@@ -238,8 +238,8 @@ class CommandSender:
     ) -> tuple[int, bool]:
         """Make ``action`` the newest set-point and send it if possible; return the intent and whether it was sent.
 
-        That is impossible while the link is down, the authority is awaited, an emergency stop has not shown, or the
-        person who flies is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
+        Sending is impossible while the link is down, the authority or an emergency stop's effect is awaited, or the
+        person flying is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
         """
         connection, schedule, authority = self._connection, self._schedule, self._authority
         if connection.why_closed:
@@ -249,12 +249,12 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            # Before schedule.ask(), nothing changes: a call that raises or returns leaves the set-point as it was.
-            wanted = not automatic or type(action) is Takeoff  # a repeated take-off is still awaited by its caller
+            # Nothing changes before schedule.ask(): calls that raise or return earlier leave the set-point as it was.
+            wanted = not automatic or type(action) is Takeoff  # the caller is still waiting for a repeated take-off
             if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
-                raise GivenUpError  # nothing was sent: newer commands stay
+                raise GivenUpError  # nothing was sent, so newer commands stay in force
             if again is not None and again != schedule.intent:
                 return again, False
             # The library's own hover must not end the application's landing or stop.
@@ -281,11 +281,11 @@ class CommandSender:
                 return intent, False
             if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        connection.poke()  # too soon after the last one: the supervisor's thread sends this one
+        connection.poke()  # too soon after the last command: the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
-        """Return the outcome of an ended intent; None while it is in progress, as far as known."""
+        """Return the outcome of an intent that has ended; None while, as far as is known, it is in progress."""
         with self._lock:
             if intent != self._schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
@@ -293,7 +293,7 @@ class CommandSender:
 
     @property
     def may_ask(self) -> bool:
-        """Whether there is a connection with the authority, so that commands can be sent now."""
+        """Whether commands can be sent now: there is a connection, and this application holds the authority on it."""
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
@@ -471,7 +471,7 @@ class CommandSender:
             elif isinstance(answer, Refused):
                 self._refusal = answer
                 changed = self._authority.given_back()
-            else:  # no answer: the next tick requests it again
+            else:  # there was no answer, so the next tick requests it again
                 self._authority.pending = False
                 changed = False
         if changed:
@@ -480,7 +480,7 @@ class CommandSender:
             self.notifier.notify()
 
     def _moved(self, before: AuthorityStatus, now_ns: int) -> None:
-        """Handle a changed status: clear the set-point after losing the authority, start sending after getting it."""
+        """Handle a changed status: clear the set-point if the authority was lost, start sending if it was granted."""
         status = self.status
         with self._lock:
             if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
@@ -538,7 +538,7 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
 
 
 def impossible(capabilities: Capabilities) -> dict[type, str]:
-    """Return the reasons for actions that neither the vehicle nor its proxy supports, by their types."""
+    """Return why actions are unsupported by both the vehicle and its proxy, by type of action."""
     if not capabilities.actions:
         return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle has no commands")
     found: dict[type, str] = {}

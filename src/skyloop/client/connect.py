@@ -27,10 +27,10 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
-WAKE_S: Final = 60.0  #: time limit for a vehicle to wake up: no driver reports that for longer
-#: Entry points named by address schemes: functions from an address to a :class:`Connector`, or None.
+WAKE_S: Final = 60.0  #: time limit for a vehicle to start up: no driver reports for longer that it is starting
+#: Entry-point group with a name per address scheme: functions that return a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
-#: Entry points for transports that reach proxies on other hosts: a module as :class:`NetworkTransport`.
+#: Entry-point group for transports to proxies on other hosts: modules that implement :class:`NetworkTransport`.
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
@@ -40,7 +40,7 @@ _numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: New places of options of earlier versions.
+#: Where the options of earlier versions have moved.
 _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
     "keys": "network=skyloop.Network"
 }
@@ -51,10 +51,10 @@ class Network:
     """A program's access to the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
 
     Attributes:
-        address: ``"10.0.0.5:7447"`` connects to an address (several with commas, ``multicast`` among them to search as
-            well); True searches by multicast; False stays on this host. None: the value of the variable
-            ``SKYLOOP_NETWORK`` or, without one, a search by multicast.
-        keys: Folder of an identity; None: from the variable ``SKYLOOP_KEYS``.
+        address: ``"10.0.0.5:7447"`` connects to an address (or several, separated by commas; ``multicast`` among them
+            also searches); True searches by multicast; False stays on this host. None: the value of the variable
+            ``SKYLOOP_NETWORK`` or, if it is not set, a search by multicast.
+        keys: Folder with an identity; None: the value of the variable ``SKYLOOP_KEYS``.
     """
 
     address: bool | str | None = None
@@ -62,11 +62,11 @@ class Network:
 
 
 class NetworkSettings(Protocol):
-    """Settings of a :class:`NetworkTransport`, which alone creates and interprets them."""
+    """Settings that only their :class:`NetworkTransport` creates and interprets."""
 
     @property
     def reach(self) -> str:
-        """Where to search for proxies, for people."""
+        """Human-readable description of where proxies are searched for."""
 
 
 class NetworkTransport(Protocol):
@@ -99,7 +99,7 @@ class ConnectOptions(TypedDict, total=False):
 
 
 def explains_moved_options(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function of :class:`ConnectOptions` so that old options raise :class:`UsageError`."""
+    """Decorate a function that takes :class:`ConnectOptions` so that old options raise :class:`UsageError`."""
 
     @wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> R:
@@ -126,26 +126,26 @@ def connect(
 ) -> Drone:
     """Connect to a drone.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
-    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s``, or 60 s,
-    it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
+    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
-            For an address, a private proxy starts, which ends with the drone and with this process. A name is looked
-            up on this host first and then, if ``network`` allows it, on the network.
+            For an address, a private proxy is started; it ends with the drone, or with this process. A name is looked
+            up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to wake up [s]; None or 0: 5 s for a name and 20 s for
+        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
             an address, and then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
             others fly is left alone, with a warning in the log.
-        authority: How a pilot requests the authority: priority, waiting, asking its holder first. None:
-            ``Authority()``.
+        authority: How a pilot requests the authority: its priority, how long it waits, whether it asks the holder
+            first. None: ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: the value of the
-            variable ``SKYLOOP_NETWORK``; without one, this host only.
+            variable ``SKYLOOP_NETWORK`` or, if it is not set, this host only.
 
     Raises:
         UnknownNameError: If no proxy of this name is running; carries suggestions.
@@ -184,7 +184,7 @@ def prepare(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
-        # The name alone is enough for another process only if it finds the proxy without network settings.
+        # Another process can use the bare name only if it finds the proxy without network settings.
         options["reach"] = target if network is None or network is False else None
         return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
@@ -206,7 +206,7 @@ def _connector(uri: str) -> Connector:
 
 
 def _script_name() -> str:
-    """Return the running script's name, for people."""
+    """Return the running script's name for display."""
     script = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python")
     stem = script.parent.name if script.stem == "__main__" else script.stem
     return (stem.strip("-") or "python")[:64]
@@ -231,8 +231,8 @@ class Connector(Protocol):
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends. It first lands a vehicle that is still
-    on a flight of ours. Ctrl-C reaches only the application, which can then land.
+    The child ends with :meth:`close`, and with this process, however that ends. Before that, it lands a vehicle that is
+    still flying for us. Ctrl-C reaches only the application, which can then land.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
@@ -242,7 +242,7 @@ class PrivateProxy:
         self.reach = self.name
         self.uri = shown_address(uri)
         self.scheduler = Scheduler()
-        self._served = False  # it may have a vehicle in the air
+        self._served = False  # whether it has served a client, and so may have a vehicle in the air
         self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
         self.pid = self._process.pid  #: process id of the child
 
@@ -297,7 +297,7 @@ class PrivateProxy:
         """Sleep until the child prints something (such as its readiness), ends, or a moment has passed."""
         stdout = self._process.stdout
         if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
-            time.sleep(0.005)  # it has closed its output and is about to end
+            time.sleep(0.005)  # the child has closed its output and is about to exit
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:

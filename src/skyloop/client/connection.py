@@ -27,19 +27,19 @@ from skyloop.messages import (
 )
 from skyloop.transport.base import Dialer
 
-_LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
-_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples retries to receive them itself
+_LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
+_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class RedialPolicy:
-    """Policy for reconnecting to a lost proxy: without limit, with growing pauses [s]."""
+    """Policy for reconnecting to a lost proxy: attempts never end, and the pauses between them grow [s]."""
 
     first_s: float = 0.02
     factor: float = 2.0
     cap_s: float = 0.3
-    hello_s: float = 1.0  #: time limit for a reached proxy to answer Hello
+    hello_s: float = 1.0  #: time limit for the answer to Hello once the proxy has been reached
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def pause_s(self, failures: int) -> float:
@@ -52,7 +52,7 @@ class _EndedError(LinkError):
 
 
 class ProxyConnection:
-    """An application's sends and requests, through whichever session exists with the proxy. Thread-safe.
+    """Sends an application's packets and requests through the current session with the proxy. Thread-safe.
 
     It is created before all its users; a :class:`ConnectionSupervisor` creates the sessions.
     """
@@ -62,31 +62,31 @@ class ProxyConnection:
         self.transmit: Callable[[bytes], bool] = _nowhere
         self.state = LinkState.CONNECTING
         self.reason = ""
-        self.why_closed = ""  #: why no requests are possible; empty while they are
-        self.poked = False  #: the supervisor must run now
+        self.why_closed = ""  #: why requests are not possible; empty while they are
+        self.poked = False  #: whether the supervisor must run now
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
         self._clock = clock
         self._topics: list[str] = []
-        self._lock = threading.Lock()  # guards the topics and the change of session
+        self._lock = threading.Lock()  # guards the topics and the switch between sessions
         self._session: ProxySession | None = None
-        self._malformed_before = self._missing_before = 0  # in earlier sessions
+        self._malformed_before = self._missing_before = 0  # totals of earlier sessions
 
     @property
     def connected(self) -> bool:
-        """Whether, as far as is known, the other end is a proxy that has answered Hello."""
+        """Whether, as far as is known, a proxy is at the other end and has answered Hello."""
         session = self._session
         return session is not None and session.open
 
     @property
     def malformed(self) -> int:
-        """Undecodable packets and frames, in all sessions."""
+        """Number of undecodable packets and frames in all sessions."""
         session = self._session
         return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
 
     @property
     def missing(self) -> int:
-        """Missing samples of feedback, judged by gaps in their numbers, in all sessions."""
+        """Number of feedback samples missing in all sessions, judged by gaps in their numbers."""
         session = self._session
         return self._missing_before + (0 if session is None else session.monitor.missing)
 
@@ -98,7 +98,7 @@ class ProxyConnection:
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive in the requested form; on one host they arrive unchanged."""
+        """Whether frames arrive in the requested form; within one host, they arrive unchanged."""
         session = self._session
         return session is not None and session.variants
 
@@ -140,7 +140,7 @@ class ProxyConnection:
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic or unsubscribe, in this session and all later ones."""
+        """Subscribe to or unsubscribe from a topic, in this session and all later ones."""
         with self._lock:
             if on == (topic in self._topics):
                 return
@@ -179,9 +179,9 @@ class ProxyConnection:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
         Args:
-            body: Makes the request, again for each attempt.
+            body: Called for each attempt; returns the request.
             timeout_s: Total time [s].
-            may_repeat: Whether to repeat the request if the link broke after it was sent and before the answer.
+            may_repeat: Whether to repeat the request if the link breaks between sending it and receiving the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
@@ -225,7 +225,7 @@ class ProxyConnection:
 
     @property
     def session(self) -> ProxySession | None:
-        """The current session; None while there is none."""
+        """The current session, if there is one."""
         return self._session
 
     def attach(self, session: ProxySession) -> None:
@@ -249,7 +249,7 @@ class ProxyConnection:
 
 
 class ConnectionSupervisor:
-    """Creates sessions with the proxy, judges their links, and replaces lost ones."""
+    """Creates sessions with the proxy, evaluates their links, and replaces lost ones."""
 
     def __init__(
         self,
@@ -262,9 +262,9 @@ class ConnectionSupervisor:
         clock: Clock = time.monotonic_ns,
         begin: Callable[[ConnectionSupervisor], None] | None = None,
     ) -> None:
-        """Prepare to connect; :meth:`start` does it.
+        """Prepare to connect; :meth:`start` connects.
 
-        ``begin`` arranges for calls of :meth:`attend` from the first session on; None: a thread makes them.
+        ``begin`` arranges for :meth:`attend` to be called from the first session on; if None, a thread calls it.
         """
         self.connection = connection
         self._handler = handler
@@ -290,7 +290,7 @@ class ConnectionSupervisor:
             try:
                 self._connect()
                 break
-            except NoAnswerError:  # Hello may have been lost, or the proxy starts slowly
+            except NoAnswerError:  # Hello may have been lost, or the proxy may be slow to start
                 if time.monotonic() > deadline:
                     raise
             except _EndedError:  # the proxy has just failed to start: dialing again raises the reason
@@ -305,7 +305,7 @@ class ConnectionSupervisor:
         self.connection.poke()
         started, me = self._thread.ident, threading.get_ident()
         if started not in (None, me) and not self.connection.receiving:
-            self._thread.join()  # not from an inline callback or the thread itself
+            self._thread.join()  # unless called from an inline callback or from the thread itself
         self._drop(ClosedError("this drone was closed"), "closed by the application")
         self._set_state(LinkState.CLOSED, "closed by the application")
 
@@ -368,7 +368,7 @@ class ConnectionSupervisor:
         return 0.0
 
     def _connect(self) -> None:
-        """Dial and send Hello. Counts as a failure until feedback arrives, so that pauses grow if it never does."""
+        """Dial and send Hello. The attempt counts as failed until feedback arrives; if it never does, pauses grow."""
         self._failures += 1
         session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock)
         session.dial(self._dial)
@@ -423,7 +423,7 @@ def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to
 
 
 class ReceivingNotifier(Notifier):
-    """A notifier for a thread that waits for samples: it receives them itself, so that a sample wakes it directly."""
+    """A notifier whose waiting thread receives samples itself, so that a sample wakes it directly."""
 
     __slots__ = ("_connection",)
 
@@ -453,9 +453,9 @@ def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
 
 
 class Scheduler:
-    """The source of a drone's time: here real time, where waiting sleeps, and a slow application misses samples.
+    """Provides a drone's time: here real time, in which waits sleep and a slow application misses samples.
 
-    A replay stepped by its application has a different one, in which waiting advances the time.
+    A replay stepped by its application has a different scheduler, in which waiting advances the time.
     """
 
     #: Whether callbacks always run on the receiving thread, so that each gets all samples.
@@ -465,7 +465,7 @@ class Scheduler:
         self.clock = clock
 
     def notifier(self) -> Notifier:
-        """Return a notifier for an application's waits."""
+        """Return a notifier for threads of the application that wait."""
         return Notifier()
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:
@@ -477,4 +477,4 @@ class Scheduler:
         supervisor.attend_for_ever()
 
     def opened(self) -> None:
-        """Called when the drone is connected, its state is known, and a pilot may command it."""
+        """Handle the end of connecting: the drone's state is known, and a pilot may command it."""

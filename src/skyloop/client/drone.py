@@ -1,4 +1,4 @@
-"""An application's drone: commands, readings, callbacks, and the end of a flight."""
+"""The drone as an application sees it: commands, readings, callbacks and the end of a flight."""
 
 from __future__ import annotations
 
@@ -100,10 +100,10 @@ R = TypeVar("R")
 T = TypeVar("T")
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
-EVENT_DEPTH: Final = 256  #: how many events, log entries and so on may wait for a slow callback
-WHOLE_S: Final = 1.0  #: time for every field of feedback to arrive after a reduced request
-_CAMERA_CHECK_S: Final = 0.5  #: how often a thread that waits for a frame checks that its camera still exists
-_SOON_S: Final = 1.0  #: a vehicle that still wakes up after this time is reported in the log
+EVENT_DEPTH: Final = 256  #: maximum number of events, log entries and so on waiting for a slow callback
+WHOLE_S: Final = 1.0  #: time limit for a complete sample of feedback, if a reduced rate was requested [s]
+_CAMERA_CHECK_S: Final = 0.5  #: how often a thread waiting for a frame checks that its camera still exists
+_SOON_S: Final = 1.0  #: a vehicle that is still starting up after this time is reported in the log
 _ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
 
@@ -116,13 +116,13 @@ class DroneOptions(TypedDict, total=False):
     stall_s: float  #: time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never
     on_exit: OnExit  #: what an airborne vehicle does at the end of the block
     policy: RedialPolicy | None  #: when to reconnect, and when a link counts as lost
-    scheduler: Scheduler | None  #: source of time and waiting; None: real time
+    scheduler: Scheduler | None  #: provides the time and the means to wait; None: real time
     on_close: Callable[[], None] | None  #: called at the end of :meth:`Drone.close`, on the closing thread
-    reach: str | None  #: name or address of the vehicle for other processes; None if they can't reach it
+    reach: str | None  #: name or address at which other processes can reach the vehicle; None if they can't
 
 
 def by_name(function: Callable[P, R]) -> Callable[P, R]:
-    """Make wrong calls of a function with keyword-only numbers raise an error that says what was meant."""
+    """Decorate a function of keyword-only numbers so that a wrong call raises an error with the correct one."""
     known = list(function.__kwdefaults__ or {})
 
     @wraps(function)
@@ -154,25 +154,25 @@ class Drone:
 
     It is a context manager, and every method is thread-safe. At the end of its block, a drone that is in the air under
     this application's authority lands, and the authority is released. Once that end has begun, commands from
-    other threads raise :class:`ClosedError`, except for an emergency stop. A drone flown by others is left to them, and
-    one that returns because of its battery keeps returning. ``sys.exit()`` in a callback ends the flight in the same
+    other threads raise :class:`ClosedError`, except for an emergency stop. A drone flown by others is left alone, and
+    one returning because its battery is low keeps returning. ``sys.exit()`` in a callback ends the flight in the same
     way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during :meth:`land` the
     landing continues. A call with ``wait=False`` has nothing to interrupt. A lost connection to the proxy is
-    re-established, however long it takes; then everything is restored except old set-points.
+    re-established, however long that takes, and everything except old set-points is restored.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. All commands except :meth:`takeoff` and
     :meth:`land` return True if the command was handed to the transport. They return False while the link is down or the
-    authority is still awaited; the command is then sent once both are there, unless it is more than half a second old.
-    Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for example on
-    the ground or while others fly the vehicle; events give the reason. Every command raises:
+    authority has not been granted yet; the command is sent once both are available, unless it is over 0.5 s old by
+    then. Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for
+    example on the ground or while others fly the vehicle; events give the reason. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
     - :class:`UnsupportedError` for a vehicle without commands,
-    - :class:`ClosedError` after :meth:`close`, and from the end of the block on.
+    - :class:`ClosedError` after :meth:`close`, or once the end of the block has begun.
 
-    The names of the reading methods tell what they return: the newest sample (:meth:`feedback`, :meth:`frame`), the
+    The name of a reading method says what it returns: the newest sample (:meth:`feedback`, :meth:`frame`), the
     next unread one (:meth:`next_feedback`, :meth:`next_frame`), or all of them (:meth:`frames`, :meth:`on_feedback`).
     """
 
@@ -206,7 +206,7 @@ class Drone:
         self._reach = reach
         self._on_close = on_close
         self._read: Feedback | None = None  # the last sample returned by feedback() or next_feedback()
-        # Each part uses those above it; the receiver handles the samples of every session.
+        # Each object uses only those created before it; the receiver handles the samples of every session.
         connection = self._connection = ProxyConnection(scheduler.clock)
         authority = AuthorityTracker(app, _ENDED)
         state = self._state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
@@ -238,11 +238,11 @@ class Drone:
 
         Args:
             timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
-                wake up [s].
+                start up [s].
             authority: How a pilot requests the authority; None: ``Authority()``.
             acquire: Whether to request the authority now; if False, the pilot does so later.
             wait_for_state: Whether to wait for feedback.
-            wake_s: Time for the vehicle to wake up, once it may be commanded [s], where that is longer.
+            wake_s: Time for the vehicle to start up once it may be commanded, if that is longer [s].
 
         Raises:
             NoAnswerError: If no answer or no feedback arrives in time.
@@ -273,7 +273,7 @@ class Drone:
             raise
 
     def _wait_until_awake(self, deadline_s: float) -> None:
-        """Wait while the vehicle wakes up, until the deadline; log what it waits for."""
+        """Wait until the vehicle has started up, or until the deadline; log what it is waiting for."""
 
         def why_asleep() -> str:
             newest = self._state.newest
@@ -326,16 +326,16 @@ class Drone:
 
     @property
     def link(self) -> LinkStatus:
-        """State of both hops, application to proxy and proxy to vehicle.
+        """State of both hops: application to proxy, and proxy to vehicle.
 
-        ``reason`` belongs to the last change or, while the proxy is lost, to the last failed attempt to reconnect.
+        ``reason`` explains the last change or, while the proxy is lost, the last failed attempt to reconnect.
         """
         status = self._state.status
         return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
 
     @property
     def start_position(self) -> Vector | None:
-        """Where the vehicle last took off, east, north, up in world axes [m]; None if unknown."""
+        """Position of the last take-off in world axes: east, north, up [m]; None if unknown."""
         newest = self._state.newest
         return None if newest is None else newest.start_position_m
 
@@ -349,7 +349,7 @@ class Drone:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay over all pilots, for which this asks the proxy and waits up to 0.2 s.
+        callback. Otherwise it is the delay across all pilots, requested from the proxy with a wait of up to 0.2 s.
         """
         found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
@@ -403,9 +403,9 @@ class Drone:
         pre-emption it returns when the other application releases it.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
             wait_s: How long to wait in the queue [s].
-            for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+            for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
@@ -439,46 +439,47 @@ class Drone:
         """Make ``action`` the newest set-point.
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
         return self._commands.command(checked(action))
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
-        While this waits, a take-off for which the vehicle is not ready yet is retried twice a second. A failed call,
-        including a time-out and Ctrl-C, cancels the take-off: the vehicle hovers if it is in the air, otherwise it
-        stays on the ground. Without ``wait``, a refused take-off is not retried.
+        If the vehicle is not ready yet, the take-off is retried twice a second during the wait. If the call fails, for
+        example by a time-out or Ctrl-C, the take-off is cancelled: the vehicle hovers if it is in the air, otherwise
+        it stays on the ground. Without ``wait``, a refused take-off is not retried.
 
         Args:
             wait: Wait until the vehicle hovers or flies; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle does not hover in time; the text has its state and, if known, the reason.
+            NoAnswerError: If the vehicle does not hover in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses the take-off in the present state; if a failsafe, a lost link, a new
-                lease or another command of this application ends it before it shows; if the application lands the
-                vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever reason.
+                lease or another command of this application ends it before it takes effect; if the application lands
+                the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
+                reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not take off later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; then nothing is sent.
+            UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
         """
         self._piloting.complete(Takeoff(), lambda feedback: feedback.state in UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the current position.
 
-        While this waits, a landing ended by a failsafe, a lost link or a lost lease is commanded again. If the
-        vehicle's own link breaks, the proxy continues the landing, even if no one waits for it.
+        A landing interrupted by a failsafe, a lost link or a lost lease is commanded again during the wait. If the
+        vehicle's own link breaks, the proxy continues the landing, even if no application is waiting for it.
 
         Args:
             wait: Wait until the vehicle has landed; otherwise only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle has not landed in time; the text has its state and, if known, the reason.
+            NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
             LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
@@ -489,7 +490,7 @@ class Drone:
         self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
-        """Stop and hold the position. Returns and raises as all commands do; see :class:`Drone`."""
+        """Stop and hold the position. Return values and exceptions are those of all commands; see :class:`Drone`."""
         return self._commands.command(Hover())
 
     def idle(self) -> bool:
@@ -507,7 +508,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
         if not _all_finite(forward, left, up, yaw_rate):
             forward, left = number("forward", forward), number("left", left)
@@ -525,7 +526,7 @@ class Drone:
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
-            True if it was handed to the transport; see :class:`Drone` for this and for the exceptions.
+            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
         if not _all_finite(roll, pitch, climb, yaw_rate):
             roll, pitch = number("roll", roll), number("pitch", pitch)
@@ -551,38 +552,38 @@ class Drone:
     ) -> None:
         """Fly straight to a position and hold it.
 
-        World axes are those of ``Feedback.position_m``. If the vehicle knows its place on the earth
+        World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
         ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application falls
-        silent: the vehicle stops there. It is held until the next command, even after a time-out; after Ctrl-C or a
-            cancelled task, the vehicle hovers. The flight does not avoid obstacles.
+        position does not decay when the application goes silent: the vehicle stops there. It is held until the next
+        command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
+        obstacles.
 
         Args:
             x: East [m].
             y: North [m].
             z: Up [m].
-            latitude_deg: [°], north positive; instead of x, y and z.
-            longitude_deg: [°], east positive.
-            altitude_m: Above mean sea level [m]; None: the current height.
-            yaw: Counter-clockwise from x, reached on the way [rad]; None: keep the current one.
+            latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
+            longitude_deg: Longitude [°], east positive.
+            altitude_m: Altitude above mean sea level [m]; None: the current height.
+            yaw: Yaw, counter-clockwise from x, reached on the way [rad]; None: keep the current yaw.
             speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
-            wait: Wait until the vehicle is there and nearly at rest; otherwise only send the command.
+            wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
-            tolerance_m: Distance from the position that counts as there [m].
-            tolerance_rad: The same for ``yaw`` [rad].
+            tolerance_m: Maximum distance from the position at arrival [m].
+            tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
 
         Raises:
-            NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
+            NoAnswerError: If it does not arrive in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
-                ends it. Also if latitude and longitude are given but the vehicle's place is unknown.
+                ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
-                then nothing is sent.
+                nothing is sent in that case.
         """
         newest = self._state.newest
         age_s = math.inf if newest is None else self.age_s(newest)
@@ -613,28 +614,28 @@ class Drone:
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it has not ended in time; the text has the vehicle's state and, if known, the reason.
+            NoAnswerError: If it is not over in time; the message gives the vehicle's state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; then the vehicle does not return later, either.
+            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If an argument makes no sense, or with ``wait`` from an inline callback; nothing is sent then.
+            UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
         """
         self._piloting.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle shows it
-        (``FlightState.EMERGENCY``), or for 8 s; then it is abandoned with an event (``vehicle_message``, reason
+        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle reports it
+        (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
         connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
-            False if the link is down, so that it can't be sent now.
+            False if the link is down and the stop can't be sent now.
 
         Raises:
             AuthorityError: If this application only observes.
@@ -646,7 +647,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If a stop of this application has not shown yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
         """
         return self._commands.command(ResetEmergency())
 
@@ -659,7 +660,7 @@ class Drone:
         position_std_m: float | None = None,
         attitude_std_rad: float | None = None,
     ) -> bool:
-        """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
+        """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
 
         Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
 
@@ -696,12 +697,12 @@ class Drone:
     ) -> Feedback:
         """Return the newest feedback.
 
-        An observer gets the least data that satisfy all its consumers, and complete samples while no consumer limits
-        its request; the first call of this method adds a permanent consumer. A pilot always gets everything.
+        An observer receives only as much data as its consumers need, and every sample as long as none of them limits
+        its request; the first call of this method adds a permanent consumer. A pilot always receives everything.
 
         Args:
             max_age_s: Maximum age since capture [s]; None: any.
-            max_hz: Sufficient rate of new samples, 0.001 to 1000 Hz; None: all.
+            max_hz: Maximum rate of new samples that is needed, 0.001 to 1000 Hz; None: all.
 
         Raises:
             NoAnswerError: If there is no feedback yet, or the newest is older than ``max_age_s``.
@@ -721,10 +722,10 @@ class Drone:
         return newest
 
     def overview(self, timeout_s: float = 2.0) -> Overview:
-        """Return the newest overview of all vehicles in the proxy's process, with one row each.
+        """Return the newest overview of all vehicles in the proxy's process, with one row per vehicle.
 
-        It is sent once a second and is much smaller than feedback, for applications that watch many vehicles. The first
-        call subscribes permanently and waits for one.
+        Overviews are sent once a second and are much smaller than feedback, which helps applications that watch many
+        vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
             timeout_s: How long to wait for the first one [s].
@@ -732,7 +733,7 @@ class Drone:
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
             ClosedError: If the drone is closed.
-            UsageError: If called from an inline callback before there is one.
+            UsageError: If called from an inline callback before the first one has arrived.
         """
         self._connection.check_open()
         state = self._state
@@ -755,7 +756,7 @@ class Drone:
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples for other consumers are returned, too.
+            max_hz: As for :meth:`feedback`; samples requested by other consumers are returned, too.
 
         Raises:
             NoAnswerError: If none arrives in time.
@@ -841,17 +842,17 @@ class Drone:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them. ``encoding``: how
-                frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80), ``"h264"`` (of
-                ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and fewer pictures
-                where that is little) or ``"raw"``; on one host all travel raw. ``max_age_s``: frames older than this
-                when their turn comes are skipped and counted as dropped.
+                ``part``: (k, n), only every n-th frame, so that n workers, with k from 0, can share the frames.
+                ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
+                ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
+                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
             NoAnswerError: If no frame arrives within ``timeout_s``.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or from an inline callback.
+            UsageError: If an option is out of range, or if called from an inline callback.
             ClosedError: If the drone was already closed.
         """
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
@@ -880,7 +881,7 @@ class Drone:
             The feedback that met the condition.
 
         Raises:
-            NoAnswerError: If it is not met in time; the text has the current state.
+            NoAnswerError: If it is not met in time; the message gives the current state.
             UnknownNameError: If there is no flight state of this name.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
@@ -949,7 +950,7 @@ class Drone:
         return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
 
     def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
-        """Call ``function``, in its own thread, whenever one of the two hops changes its state; up to 256 wait."""
+        """Call ``function``, in its own thread, whenever one of the two hops changes state; up to 256 changes wait."""
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
@@ -1032,18 +1033,18 @@ class Drone:
     ) -> Listener[EncodedFrame]:
         """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
-        Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing picture, the next one is a key picture, requested from the proxy. Without
-        ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
-        encoded by the proxy at the rate that the path carries.
+        Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
+        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
+        ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it doesn't send H.264, encoded by
+        the proxy at the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate of an encoding by the proxy, shared by all who request the same [kbit/s].
+            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
             max_fps: Maximum pictures per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; beyond that, some are lost.
+            depth: How many pictures may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Returns:
@@ -1082,14 +1083,14 @@ class Drone:
         Args:
             frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the part that drew them; None: this application. Only the newest per source and camera
-                counts.
+            source: Name of the component that drew them; None: this application. For each source and camera, new shapes
+                replace earlier ones.
 
         Returns:
             True if they were handed to the transport.
 
         Raises:
-            UsageError: If something is not a shape, there are too many, coordinates are not finite, or colours are not
+            UsageError: If an item is not a shape, there are too many, coordinates are not finite, or colours are not
                 within 0 to 255.
         """
         height, width = frame.shape[:2]
@@ -1106,7 +1107,7 @@ class Drone:
 
         Args:
             kind: Kind of the event.
-            text: Text for people.
+            text: Human-readable text.
             severity: Severity of the event.
             **data: Details, by name.
         """
@@ -1139,7 +1140,7 @@ class Drone:
     def results(self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0) -> Iterator[Result]:
         """Yield a processor's newest result repeatedly until the drone is closed.
 
-        A slow loop skips results; these and those that are too old are counted in :attr:`stats`. Errors are raised by
+        A slow loop skips results; :attr:`stats` counts them, as well as those that are too old. Errors are raised by
         the first iteration, not by the call.
 
         Args:
@@ -1149,7 +1150,7 @@ class Drone:
 
         Raises:
             NoAnswerError: If no sufficiently new result arrives in time.
-            UsageError: If ``processor`` is not a valid name, ``max_age_s`` is negative, or from an inline callback.
+            UsageError: If ``processor`` is invalid, ``max_age_s`` is negative, or if called from an inline callback.
             ClosedError: If the drone was already closed.
         """
         mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
@@ -1177,8 +1178,8 @@ class Drone:
         Args:
             function: Called in its own thread.
             processor: Name of the processor; None: all processors.
-            max_age_s: Results older than this when their turn comes are skipped, and counted in the listener's
-                ``expired`` [s]; None: none are.
+            max_age_s: Maximum age [s]; results older than this when their turn comes are skipped and counted in the
+                listener's ``expired``. None: no limit.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
@@ -1203,9 +1204,9 @@ class Drone:
     # The end ---------------------------------------------------------------------------------------------------
 
     def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Run the checklist before a flight; each finding has its reason and a remedy.
+        """Run the pre-flight checklist; each finding comes with a reason and a remedy.
 
-        Asks the proxy for its parameters, and each camera for a picture. Flies nothing and needs no authority.
+        Reads the proxy's parameters and requests a picture from each camera. Doesn't fly and needs no authority.
 
         Args:
             video_s: Total time to wait for pictures [s]; 0: don't check cameras.
@@ -1234,7 +1235,7 @@ class Drone:
             return
         self._piloting.finish_stop()
         self._connection.why_closed = "this drone was closed: connect again"
-        self._commands.notifier.notify()  # no thread gets the authority from here on
+        self._commands.notifier.notify()  # from here on, no thread gets the authority
         try:
             if self._connection.connected:
                 self._commands.release(wait=not self._connection.receiving)
@@ -1245,7 +1246,7 @@ class Drone:
             listeners = list(self._state.listeners)
             for listener in listeners:
                 listener.cancel(wait=False)
-            deadline_s = time.monotonic() + JOIN_S  # for all of them together
+            deadline_s = time.monotonic() + JOIN_S  # shared by all of them
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
             for one in list(self._state.to_close):
@@ -1311,9 +1312,9 @@ def open_drone(
     """Connect through a dialer; applications call :func:`skyloop.connect`.
 
     Args:
-        dial: Connects to the proxy, now and after each loss.
+        dial: Connects to the proxy, first now and again after each loss.
         app: Name of this application, 1 to 64 characters.
-        timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to wake up [s].
+        timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to start up [s].
         authority: As for :func:`skyloop.connect`.
         **options: See :class:`DroneOptions`.
 

@@ -1,4 +1,4 @@
-"""Frames for applications: NumPy arrays with their camera, their times and the vehicle's state at capture."""
+"""Frames for applications: NumPy arrays that know their camera, times and the vehicle's state at capture."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ else:
     _Base = np.ndarray
 
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-HISTORY_DEPTH: Final = 256  #: stored samples of feedback: 8 s at 32 Hz
-_PNG_LEVEL: Final = 1  #: compression level: a notebook shows pictures at once and rarely keeps them
+HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
+_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display pictures at once and rarely keep them
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
 )
-_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: names that other libraries use
+_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: names that other libraries give to the image
 
 
 class Frame(_Base):
     """An image as a read-only BGR array of shape (height, width, 3) and dtype uint8; draw on ``frame.copy()``.
 
     It is a NumPy array, so NumPy and OpenCV accept it directly. Where a plain array is needed, ``numpy.asarray(frame)``
-    gives the same memory without the attributes below. If possible it is the memory that the transport received,
-    without a copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times are in
-    ns: ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock; ``received_ns`` on ours.
+    gives the same memory without the attributes below. Where possible, it is the transport's memory itself, not a
+    copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times [ns]
+    are ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on ours.
     """
 
     _arrival: Arrival
@@ -64,7 +64,7 @@ class Frame(_Base):
 
     @property
     def seq(self) -> int:
-        """Number of the frame; grows by one with each frame of the camera, dropped ones included."""
+        """Sequence number, which increases by one with each frame of the camera, including dropped ones."""
         return self._arrival.header.seq
 
     @property
@@ -127,7 +127,7 @@ class Frame(_Base):
             raise AttributeError(
                 f"this array was derived from a frame and has no {name}: only the delivered frame has it"
             )
-        if name in _THE_IMAGE:  # for a name without an object, Python adds no guess ("imag")
+        if name in _THE_IMAGE:  # without ``obj``, Python doesn't append a guess ("imag")
             raise AttributeError(f"a frame has no {name}: it is the image itself, a NumPy array", name=name)
         raise AttributeError(f"a frame has no attribute {name!r}")
 
@@ -138,7 +138,7 @@ def png(image: NDArray[Any]) -> bytes | None:
     if image.dtype != np.uint8 or not image.size or not (grey or (image.ndim == 3 and image.shape[2] == 3)):
         return None
     height, width = image.shape[:2]
-    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each starts with its filter type: none
+    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each row starts with its filter type: none
     rows[:, 1:] = (image if grey else image[:, :, ::-1]).reshape(height, -1)
     head = struct.pack(">IIBBBBB", width, height, 8, 0 if grey else 2, 0, 0, 0)
     parts = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), _PNG_LEVEL)), (b"IEND", b""))
@@ -336,7 +336,7 @@ class FeedbackHistory:
         self._samples: deque[Feedback] = deque(maxlen=depth)
 
     def add(self, sample: Feedback) -> None:
-        """Add a sample; one captured before the newest, from a restarted proxy, restarts the history."""
+        """Add a sample; if it was captured before the newest one (by a restarted proxy), start the history over."""
         samples = self._samples
         if samples and sample.captured_ns < samples[-1].captured_ns:
             samples.clear()
@@ -346,7 +346,7 @@ class FeedbackHistory:
         """Return the state at a time on the proxy's clock.
 
         Args:
-            captured_ns: The time.
+            captured_ns: Time on the proxy's clock [ns].
 
         Returns:
             The state, its reach [s], and whether there was a sample on each side. The reach is the time to the more
@@ -368,7 +368,7 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Return the state between two samples, linear in time, with angles along the shorter way.
+    """Interpolate the state linearly between two samples, with angles along the shorter way.
 
     Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
 

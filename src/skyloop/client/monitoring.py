@@ -1,4 +1,4 @@
-"""Judge a connection by arrival times: the state of the hop to the proxy, its clock, statistics. Pure."""
+"""Evaluate a connection by arrival times: the link to the proxy, its clock, and statistics. Pure."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds
 from skyloop.messages import LinkState
 
-#: Maximum relative drift: quartz is accurate to 50 ppm, and time services correct its rate by as much again; both
-#: clocks may deviate in opposite directions.
+#: Maximum relative drift between two clocks: quartz is accurate to 50 ppm, time services correct its rate by up to as
+#: much again, and the two clocks may deviate in opposite directions.
 MAX_DRIFT: Final = 200e-6
-DEPTH: Final = 1024  #: stored samples of each channel, a power of two
+DEPTH: Final = 1024  #: number of samples stored per channel, a power of two
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,31 +25,31 @@ class Thresholds:
 
     late_s: float = 0.3  #: time without feedback before the link is degraded
     silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
-    missing_share: float = 0.1  #: share of missing or malformed samples in the last window that makes the link degraded
+    missing_share: float = 0.1  #: fraction of missing or malformed samples in the last window that degrades the link
     window_s: float = 1.0
     malformed: int = 5  #: malformed packets within a window that make the link lost and reconnected
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The monitor's verdict on the arrivals so far."""
+    """The monitor's assessment of the arrivals so far."""
 
     state: LinkState
     reason: str
     restart: bool = False  #: the connection should be closed and re-established
 
 
-_Counts = tuple[int, int, int]  #: at_ns, received, missing: totals at some time
+_Counts = tuple[int, int, int]  #: at_ns, received, missing: a time and the totals at that time
 
-#: Maximum silence that a low rate of feedback excuses [s]: a link with a lower rate is checked by pings.
+#: Maximum silence tolerated because of a low feedback rate [s]; links with even lower rates are checked by pings.
 MAX_PATIENCE_S: Final = 2.0
-WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for the share of missing ones
+WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the fraction of missing ones
 
 
 class LinkMonitor:
-    """Watches one connection. :meth:`verdict` does the work; the other methods cost a few attribute writes.
+    """Monitors one connection. :meth:`verdict` does the work; the other methods only write a few attributes.
 
-    Samples carry consecutive numbers: a gap, less the samples that the proxy left out for a lower rate, is a loss.
+    Samples carry consecutive numbers: a gap, minus the samples that the proxy left out to lower the rate, is a loss.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
@@ -57,25 +57,25 @@ class LinkMonitor:
         self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ping
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
-        self._no_gaps_ns = 0  # until then, gaps may come from a change of the request
+        self._no_gaps_ns = 0  # until then, gaps may result from a changed request
         self.received_ns = now_ns  #: when any valid packet last arrived
-        self.feedback_ns = 0  #: when feedback last arrived; 0 for never
-        self.received = 0  #: samples of feedback
-        self.missing = 0  #: samples missing, judged by gaps in their numbers
+        self.feedback_ns = 0  #: when feedback last arrived; 0 if never
+        self.received = 0  #: number of feedback samples received
+        self.missing = 0  #: number of samples missing, judged by gaps in their numbers
         self.malformed_count = 0
         self._last_seq: int | None = None
         self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
     def excuse(self, silence_s: float) -> None:
-        """Tolerate this much more silence before the link counts as lost, for networks with pauses [s]."""
+        """Tolerate this much more silence [s] before the link counts as lost, for networks with pauses."""
         self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
         self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
-        """Set the expected time between two samples of feedback [s]; 0: all are sent."""
+        """Set the expected time between two feedback samples [s]; 0 if all are sent."""
         limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
-        # A switch loses no samples, but leaves a gap in the numbers and takes time until the first new sample.
+        # Switching loses no samples, but leaves a gap in the numbers, and the first new sample takes a while.
         self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
         self.received_ns = max(self.received_ns, now_ns)
         if self.feedback_ns:
@@ -86,7 +86,7 @@ class LinkMonitor:
         self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
 
     def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
-        """Note a sample of feedback; the proxy left out ``skipped`` samples before it.
+        """Record a feedback sample; the proxy left out ``skipped`` samples before it.
 
         Returns False if it is a duplicate or was overtaken by a newer one.
         """
@@ -103,12 +103,12 @@ class LinkMonitor:
         return True
 
     def _gap(self, gap: int, skipped: int, now_ns: int) -> None:
-        """Count the samples missing between two, given that ``skipped`` were left out before each."""
+        """Count the samples missing in a gap, given that ``skipped`` are left out before each one."""
         if gap > skipped and now_ns >= self._no_gaps_ns:
             self.missing += -((skipped - gap) // (skipped + 1))
 
     def malformed(self) -> None:
-        """Note a packet that could not be decoded."""
+        """Record a packet that could not be decoded."""
         self.malformed_count += 1
 
     def verdict(self, now_ns: int) -> Verdict:
@@ -143,17 +143,17 @@ class LinkMonitor:
 
 
 class StallWatch:
-    """Detects that one channel has stalled while others flow, so that it is resubscribed.
+    """Detects that one channel has stalled while others deliver, so that it can be resubscribed.
 
-    After a silence of all channels, the time starts again, because this channel may be the last to return.
+    After a silence of all channels, the measurement starts over, because this channel may be the last to resume.
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
-        """Start to watch a channel, which counts as stalled after a silence of ``patience_s``."""
+        """Start watching a channel, which counts as stalled after a silence of ``patience_s``."""
         self._patience_ns = nanoseconds(patience_s)
-        self.received_ns = now_ns  #: when this channel last got something
+        self.received_ns = now_ns  #: when this channel last delivered
         self._asked_ns = now_ns
-        self._flow_ns = now_ns  # since when the others flow
+        self._flow_ns = now_ns  # start of the period in which the others have been delivering
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
         """Return whether to resubscribe now; True at most once in ``patience_s``."""
@@ -175,7 +175,7 @@ class Offset:
 
 @dataclass(frozen=True, slots=True)
 class _Trip:
-    sent_ns: int  # on our clock; since then, the drift bounds the offset's change
+    sent_ns: int  # on our clock; the drift bounds how much the offset has changed since
     low_ns: int
     high_ns: int
 
@@ -183,14 +183,14 @@ class _Trip:
 class OffsetEstimator:
     """Estimates the offset between two monotonic clocks from round trips.
 
-    The proxy wrote its answer between sending and receiving, which bounds the offset whatever the delay in each
+    The proxy wrote its answer between sending and receiving, which bounds the offset regardless of the delay in each
     direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds of a round trip widen over time with
     the possible drift of the clocks, and the truth lies within the bounds of all round trips (Marzullo and Owicki,
     "Maintaining the time in a distributed system", 1983).
     """
 
     def __init__(self, depth: int = 16, max_drift: float = MAX_DRIFT) -> None:
-        """Start with an offset of 0; ``max_drift``: maximum relative difference of the clocks' rates."""
+        """Start with an offset of 0; ``max_drift`` is the maximum relative difference between the clocks' rates."""
         self._trips: deque[_Trip] = deque(maxlen=depth)
         self._max_drift = max_drift
 
@@ -236,13 +236,13 @@ class ChannelStats:
     """Statistics of one channel since the drone was connected. Unknown values are None.
 
     Attributes:
-        count: Samples received; for commands, sent.
+        count: Samples received; for commands, commands sent.
         rate_hz: Samples per second, over the last two seconds.
         lost: Samples missing, judged by gaps in their numbers; for video including those that the proxy left out.
         dropped: Samples replaced by newer ones before their consumer took them; for commands, those that the transport
             did not accept.
         malformed: Undecodable samples.
-        delay_s: From publishing to receiving, for the last 1024 samples; for commands, from sending to applying.
+        delay_s: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
         age_s: Time since the newest sample's capture.
         uncertainty_s: Maximum error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
     """
@@ -258,7 +258,7 @@ class ChannelStats:
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
-    """Return the distribution of delays [ns]; None for none."""
+    """Return the distribution of delays [ns]; None if there are none."""
     if not delays_ns.size:
         return None
     seconds = np.sort(delays_ns) / 1e9
@@ -284,7 +284,7 @@ class ChannelCounter:
         self.lost = 0
         self.dropped = 0
         self.malformed = 0
-        self.captured_ns: int | None = None  #: of the newest sample, on our clock
+        self.captured_ns: int | None = None  #: capture time of the newest sample, on our clock
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:

@@ -30,17 +30,17 @@ from skyloop.messages import (
 )
 
 ANSWER_S = 2.0
-MAX_TEXT = 4096  #: characters
+MAX_TEXT = 4096  #: characters in a text value
 MAX_NUMBERS = 256
 _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusal.OBSERVER})
 
 
 class Restorer:
-    """Rewrites parameters after the proxy restarted and so forgot the application's values.
+    """Rewrites parameters after a restart of the proxy, which loses the application's values.
 
-    Only values, never momentary parameters, and only if no one else can have written since: a lost link alone changes
-    nothing at the proxy, and other pilots' newer values stay. Leases are numbered from 1 in each run of the proxy, so a
-    gap between two of our own shows that another application held the authority then, and may have written.
+    It rewrites only values, never momentary parameters, and only if no other application can have written since: a
+    lost link alone changes nothing at the proxy, and other pilots' newer values stay. Each run of the proxy numbers its
+    leases from 1, so a gap between two of ours means that another application held the authority and may have written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
@@ -49,23 +49,23 @@ class Restorer:
         self._lock = threading.Lock()
         self._written: dict[str, Value] = {}
         self._run_id = 0
-        self._lease = 0  # our last one in this run
+        self._lease = 0  # our last lease in this run of the proxy
         self._missed = False  # the connection was lost since that lease, so events may be missing
         self._restore = False  # the proxy has restarted since the values were written
 
     def written(self, parameter: Parameter) -> None:
-        """Note a value that the application has written."""
+        """Record a value that the application has written."""
         if not parameter.momentary:
             with self._lock:
                 self._written[parameter.name] = parameter.value
 
     def overwritten(self, name: str) -> None:
-        """Note that another application has written this parameter."""
+        """Record that another application has written this parameter."""
         with self._lock:
             self._written.pop(name, None)
 
     def connected(self, run_id: int) -> None:
-        """Note a new connection, to this run of the proxy."""
+        """Handle a new connection, to this run of the proxy."""
         with self._lock:
             self._missed = True
             if run_id != self._run_id:
@@ -106,7 +106,7 @@ class Config(Mapping[str, Value]):
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
     restarted proxy forgets written values; they are rewritten with the next grant of the authority, unless another
     application held it in between. Momentary parameters, such as a flip, never are. Every method waits for the proxy's
-    answer and raises :class:`NoAnswerError` after 2 s without one.
+    answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:
@@ -129,7 +129,7 @@ class Config(Mapping[str, Value]):
             ParameterError: If the proxy refuses it, with its reason.
             AuthorityError: If the authority is not held.
             UnknownNameError: If there is no such parameter; carries suggestions.
-            UsageError: If the value's type is not one of a parameter.
+            UsageError: If no parameter can have a value of this type.
             LinkError: If the link broke before the answer and the parameter is momentary: it may have been executed.
         """
         plain = plain_value(name, value)

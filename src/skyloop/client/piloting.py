@@ -1,4 +1,4 @@
-"""An application's piloting of its vehicle: waiting for commands, letting go, and the end of the flight."""
+"""How an application pilots its vehicle: it waits for commands, lets the vehicle go, and ends the flight."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, SET_POINTS
 
 OnExit = Literal["land", "hover"]
-STOP_S: Final = 2.0  #: how long closing waits for an emergency stop to show [s]
+STOP_S: Final = 2.0  #: how long closing waits for the vehicle to report an emergency stop [s]
 LANDING_S: Final = 20.0  #: how long to wait for a landing [s]
-OTHERS_S: Final = 1.0  #: time for feedback to show who took a vehicle whose landing was refused [s]
+OTHERS_S: Final = 1.0  #: time for feedback to show which application took a vehicle whose landing was refused [s]
 RETURN_S: Final = 180.0  #: how long to wait for a return that the proxy started [s]
-AGAIN_NS: Final = 500_000_000  #: between attempts of a take-off that is not possible yet
-#: For proxies that report no outcome: feedback received sooner after a command may be older than it.
+AGAIN_NS: Final = 500_000_000  #: interval between attempts at a take-off that is not possible yet [ns]
+#: If the proxy reports no outcome, feedback received sooner than this after a command may predate it [ns].
 _STALE_NS: Final = 100_000_000
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -77,7 +77,7 @@ class Piloting:
         self._state = state
         self._on_exit = on_exit
         self._close = close
-        self._end = threading.Lock()  # only one end of the flight at a time, whoever requests it
+        self._end = threading.Lock()  # ensures that only one caller ends the flight
         leave_to_parent(self)
 
     @property
@@ -104,15 +104,15 @@ class Piloting:
         *,
         automatic: bool = False,
     ) -> None:
-        """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
+        """Send the command and, with ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
 
-        After a take-off that is not done in time, let the vehicle go. Also if the caller stops waiting, for example
-        after Ctrl-C, unless it waited for a landing.
+        If a take-off is not done in time, let the vehicle go. Do so too if the caller stops waiting, for example
+        after Ctrl-C, unless it was waiting for a landing.
         """
         if not wait:
             self.commands.command(action, now=True)
             return
-        if type(action) is not Land:  # a landing is commanded in any case: nothing is safer
+        if type(action) is not Land:  # a landing is commanded in any case, as nothing is safer
             self._connection.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
         waiting = None
@@ -142,11 +142,11 @@ class Piloting:
                 self.let_go(f"{where} ended the program", land=True)
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover or land because the library decides that it must: the only place where it does so on its initiative.
+        """Hover or land by the library's own decision; this is the only place where it does so.
 
-        No person decided it, so the vehicle is left alone, here and by the proxy, if others fly it or it is landing or
-        returning, and also if the application itself has landed or stopped it. A take-off that does not show is
-        cancelled. With ``land`` it lands rather than hovers. Returns whether something was sent.
+        As no person decided it, the vehicle is left alone, here and by the proxy, if others fly it, if it is landing or
+        returning, or if the application itself has landed or stopped it. A take-off without visible effect is
+        cancelled. With ``land``, it lands rather than hovers. Returns whether anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -171,7 +171,7 @@ class Piloting:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
         From the start, commands from the application's other threads raise :class:`ClosedError`; only an emergency stop
-        still passes. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report`` is
+        is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report`` is
         called with a text for each step. Returns the error, or None.
         """
         if self.closed:  # also in a fork, where another thread may have held the locks
@@ -210,13 +210,13 @@ class Piloting:
         except RefusedError as error:
             if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
                 return error
-            report(f"{self._others_hands()}: leaving the drone to it")  # also another controller that has just taken it
+            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that has just taken it
         except SkyloopError as error:
             return error
         return None
 
     def finish_stop(self) -> None:
-        """Wait up to 2 s until an emergency stop has shown, because it would end with the connection."""
+        """Wait up to 2 s until the vehicle reports an emergency stop, which would otherwise end with the connection."""
         if self._connection.connected and not self._connection.receiving:
             self._state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
 
@@ -235,15 +235,15 @@ class Piloting:
         """Return whether this application has the vehicle in the air, or has just commanded a take-off."""
         newest = self._state.newest
         if self._state.status.vehicle is LinkState.CLOSED:
-            return False  # a recording that has ended: nothing to land
+            return False  # a recording that has ended has nothing to land
         airborne = newest is not None and newest.state.airborne
         if newest is not None and newest.others:
-            return False  # also flown by others: not ours to land or stop
+            return False  # others fly it, too: we must not land or stop it
         return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
 
 
 class ActionWait:
-    """One commanded action, and the wait for feedback that shows its completion."""
+    """Sends one action, and waits for feedback that shows its completion."""
 
     def __init__(
         self,
@@ -263,18 +263,18 @@ class ActionWait:
         self._state = state
         self._connection = connection
         self._problem: Exception | None = None
-        self._why = ""  # why it was not done yet, for people
+        self._why = ""  # why it was not done yet, as text
         self._why_link: LinkState | None = None  # the vehicle's link at that time, which the text may mention
-        self._flew = False  # it has been in the air since
-        self._refused, self._refused_ns = 0, 0  # our newest intent that was not possible yet, and since when
+        self._flew = False  # whether it has been in the air since
+        self._refused, self._refused_ns = 0, 0  # our newest intent that was not possible yet; its first refusal
         self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle from its pilot at that time, or at the first time that it can be sent.
+        # The call may take the vehicle from whoever flies it now, or at the first time that it can be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = commands.ask(action, automatic=automatic)
 
     @property
     def outdone(self) -> bool:
-        """Whether the application has since commanded something else. A set-point behind a take-off does not count."""
+        """Whether the application has commanded something else since. A set-point after a take-off does not count."""
         commands = self._commands
         behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
         return commands.intent != self._intent and not behind
@@ -299,7 +299,7 @@ class ActionWait:
             raise self._problem
 
     def _over(self) -> bool:
-        """Return whether the action is done, or waiting longer can't help."""
+        """Return whether the action is done, or waiting longer would be pointless."""
         if type(self._action) is Land and self._done():  # whoever landed it
             return True
         self._problem = self._why_not()
@@ -319,11 +319,11 @@ class ActionWait:
         if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
             return False
         if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
-            return outcome.over  # it was already on the ground: a take-off may have been on its way
+            return outcome.over  # already on the ground, but a take-off may still have been in transit
         return True
 
     def _why_not(self) -> Exception | None:
-        """Return why waiting longer can't help; None if it can. Repeats a request that may succeed later."""
+        """Return why waiting longer would be pointless; None if it isn't. Repeats a request that may succeed later."""
         name = self._action.name
         if self._connection.why_closed or (self._commands.barred and not self._automatic):
             return ClosedError(f"this drone was closed during {name}")
@@ -335,7 +335,7 @@ class ActionWait:
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
             self._note(told.text)  # cleared once a repeat is executed
-            if not told.over:  # executed: later holders took the vehicle afterwards
+            if not told.over:  # it was executed, so later holders took the vehicle afterwards
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -363,8 +363,8 @@ class ActionWait:
             now_ns, newest = self._state.scheduler.clock(), self._state.newest
             if self._refused != self._intent:
                 self._refused, self._refused_ns = self._intent, now_ns
-            # Its withdrawal first shows as a landing, which would end another take-off. A vehicle that still wakes up
-            # is asked again once awake, because until then it can only refuse.
+            # Its withdrawal first appears as a landing, which would end another take-off. A vehicle that is still
+            # starting up can only refuse, so the request is repeated afterwards.
             stands = newest is not None and not newest.state.airborne and not newest.waking_up
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
@@ -376,28 +376,28 @@ class ActionWait:
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
-            if rose or not self._commands.may_ask:  # once risen, it hovers in the end: the take-off is done
+            if rose or not self._commands.may_ask:  # once risen, it hovers in the end and the take-off is done
                 return None
             text = f"takeoff was ended because {ENDINGS[outcome.fate]}: take off again"
             return RefusedError(text, code=Refusal.NOT_FRESH)
         return _refused(outcome)
 
     def _called_off(self) -> bool:
-        """Return whether another command of the application, before or after its start, ends the take-off."""
+        """Return whether another command by the application ends the take-off, before or after it has started."""
         commands, newest = self._commands, self._state.newest
         if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
             return True
-        # A hover or idle ends a take-off that does not show yet: if the vehicle still stands, it is over.
+        # A hover or idle ends a take-off without visible effect: if the vehicle is still on the ground, it is over.
         stayed, told = commands.latest(Hover, Idle), commands.told
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
-        """Return why waiting can't help. Nothing old is resent, but the caller still waits for this landing."""
+        """Return why waiting is pointless. Old commands aren't resent, but the caller still awaits this landing."""
         if outcome.fate in OVERRULED:
             if self._commands.may_ask:
-                # The caller still wants it, but a pilot who has since taken the vehicle by hand keeps it. That is not
-                # visible while the application's own link is lost.
+                # The caller still wants to land, but a pilot who has since taken over by hand keeps the vehicle. This
+                # is not visible while the application's own link is lost.
                 taken = self._may_be_sent and self._others_now not in (None, self._others)
                 self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
             return None
@@ -443,5 +443,5 @@ def _refused(outcome: Outcome) -> RefusedError:
 
 
 def _returns(feedback: Feedback) -> bool:
-    """Return whether a failsafe flies the vehicle back to its start."""
+    """Return whether a failsafe is flying the vehicle back to its start."""
     return feedback.failsafe is Failsafe.LAND and feedback.return_phase is not ReturnPhase.NONE

@@ -21,15 +21,15 @@ from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
-STALE_S: Final = 1.0  #: older feedback is not current [s]
+STALE_S: Final = 1.0  #: maximum age of current feedback [s]
 STALE_VIDEO_S: Final = 1.0
-CLOCK_S: Final = 0.05  #: required accuracy of samples' ages [s]
-LEVEL_RAD: Final = 0.12  #: a vehicle tilted by more does not stand level
-ACTIVE: Final = "camera.active"  #: the parameter of vehicles that send one camera at a time
+CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
+LEVEL_RAD: Final = 0.12  #: maximum tilt of a vehicle that counts as level [rad]
+ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, on vehicles that send one at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
 FULL_BYTES: Final = 100_000_000
-FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away does not count
+FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is ignored [m]
 
 
 class Level(StrEnum):
@@ -65,9 +65,9 @@ class PreflightState:
 
     Attributes:
         name: The drone's name, for commands in remedies.
-        link: Both hops.
+        link: State of both hops.
         capabilities: The vehicle's capabilities.
-        feedback: The newest sample; None: none yet.
+        feedback: The newest sample; None if there is none yet.
         feedback_age_s: Its age [s].
         video_age_s: Age of each camera's newest picture [s]; None: none arrived in time.
         parameters: Values by name; empty: they were not read.
@@ -181,7 +181,7 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
-    # The advice of drivers and of the checks above is for any drone; a person wants a command to copy.
+    # Drivers and the checks above give advice for any drone; with the drone's name, its commands can be copied.
     return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
@@ -190,7 +190,7 @@ def _ok(check: str, detail: str) -> PreflightFinding:
 
 
 def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
-    """Return a finding of that level; a good one has neither a reason nor a remedy."""
+    """Return a finding with this level; a good one has neither a reason nor a remedy."""
     return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 

@@ -1,4 +1,4 @@
-"""An application's publications besides commands: its log, and its results as a processor's worker."""
+"""What an application publishes besides commands: its log, and its results as a processor's worker."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
 
 RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; a worker counts as silent after one second
-MAX_DIMENSIONS: Final = 8  #: of an array in the log
+MAX_DIMENSIONS: Final = 8  #: maximum number of dimensions of an array in the log
 
 
 class Logbook:
@@ -50,7 +50,7 @@ class Logbook:
         self._source = source
 
     def text(self, text: str, *, name: str = "", severity: Severity | str = Severity.INFO) -> bool:
-        """Publish a line for people.
+        """Publish a line of text.
 
         Args:
             text: At most 4096 characters.
@@ -73,7 +73,7 @@ class Logbook:
         return self._send(_named(name), number=_finite(name, value))
 
     def numbers(self, **values: float) -> bool:
-        """Publish one finite value of each series named: ``drone.log.numbers(range_m=1.2, bearing=0.1)``."""
+        """Publish one finite value of each of these series: ``drone.log.numbers(range_m=1.2, bearing=0.1)``."""
         known = [(_named(name), _finite(name, value)) for name, value in values.items()]
         return sum(self._send(name, number=value) for name, value in known) == len(known)
 
@@ -141,7 +141,7 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` does it. ``find`` returns the camera's name, even after the proxy restarts."""
+        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, even after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
@@ -150,7 +150,7 @@ class Membership:
         self._find = find
         self.code = code
         self.shared = shared
-        #: Called at each renewal: whether this worker can take frames; False gives its share to the others.
+        #: Called at each renewal; returns whether this worker can take frames. False gives its share to the others.
         self.ready: Callable[[], bool] = _always
         #: The newest share; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None

@@ -21,8 +21,8 @@ from skyloop.transport.base import RESULTS, results
 
 T = TypeVar("T")
 _UNREAD: Final = object()
-MAX_CHANNELS: Final = 256  #: known processors without subscriptions
-MAX_WORKERS: Final = 1024  #: workers of one processor whose last numbers are stored
+MAX_CHANNELS: Final = 256  #: maximum number of processors remembered without a subscription
+MAX_WORKERS: Final = 1024  #: maximum number of workers per processor whose last numbers are remembered
 
 
 class Result:
@@ -72,7 +72,7 @@ class Result:
 
     @property
     def made_ns(self) -> int:
-        """When the processor had finished it."""
+        """When the processor finished it."""
         return self.header.made_ns
 
     @property
@@ -122,7 +122,7 @@ def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (signature of msg
 
 
 class ResultMailbox:
-    """Keeps the newest result of each processor for one consumer, and skips results too old when taken."""
+    """Keeps the newest result of each processor for one consumer; skips results that are too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
         """Create an empty mailbox that skips results older than ``max_age_s`` [s] when taken."""
@@ -191,7 +191,7 @@ def is_old(result: Result, max_age_s: float | None) -> bool:
 
 
 class ResultListener(Listener[Result]):
-    """A listener that skips results too old when their turn comes, and counts them in ``expired``."""
+    """A listener that skips results that are too old when their turn comes, and counts them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
         """Start calling the function; arguments as for :class:`Listener`, and ``max_age_s`` [s], None: no limit."""
@@ -212,7 +212,7 @@ class ResultListener(Listener[Result]):
 
 
 class ResultChannel(Channel[Result]):
-    """Results of one processor, without those of frames older than a previous result's."""
+    """Results of one processor, except those for frames older than a previous result's frame."""
 
     def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
         self.name = results(processor)  #: name of the topic

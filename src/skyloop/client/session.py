@@ -1,4 +1,4 @@
-"""One session with a proxy, from its first packet to its last: the transport's callbacks, and requests."""
+"""One session with a proxy, from the first packet to the last: callbacks of the transport, and requests."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from skyloop.messages import (
 from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, stream, video
 
-RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
+RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
 
-#: Called once, with the answer or with an error.
+#: A callback for the answer to a request, or the error; called once.
 Done = Callable[[AnyReply | LinkError], None]
 
 
@@ -107,7 +107,7 @@ class Requests:
             pending.done(NoAnswerError(f"the proxy did not answer {pending.what} within {pending.timeout_s:g} s"))
 
     def fail(self, error: LinkError) -> None:
-        """Answer all requests, present and future, with ``error``: the connection is gone."""
+        """Answer all present and future requests with ``error``, because the connection is gone."""
         with self._lock:
             self._failed = error
             pending, self._pending = list(self._pending.values()), {}
@@ -118,22 +118,22 @@ class Requests:
 PING_S: Final = 1.0  #: time limit for a ping
 FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
-_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to ask a proxy on another clock for its time
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
+_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock if it differs from ours
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval until there are a few round trips
 _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
     """Receives samples on the receiving thread, and changes of the connection on the supervisor's."""
 
-    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello and has sent nothing else yet
+    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, but sent nothing else yet
     def disconnected(self) -> None: ...
     def link_changed(self, state: LinkState, reason: str) -> None: ...
-    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns the latest time of the next call [ns]
+    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns when to call it again at the latest [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: for the other kinds, and the time
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers of the other kinds
 
 
 class ProxySession:
@@ -151,15 +151,15 @@ class ProxySession:
         self._clock = clock
         self._end: TransportClient | None = None
         self._same_clock = False
-        self._quiet = False  # closed by this end: ignore later arrivals
+        self._quiet = False  # closed by this end, so later arrivals are ignored
         self._up = False
         self._pinged_ns = 0
         self._pinged = False  # a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # by the transport's topic: the topics that it serves
+        self._video_users: dict[str, set[str]] = {}  # for each of the transport's topics, the topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # how feedback arrives in this session
+        self._feedback = PLAIN  # the form in which feedback arrives in this session
         self._only_plain = False  # the proxy sends no other form
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
@@ -167,12 +167,12 @@ class ProxySession:
         self.offset_ns = 0  #: the proxy's clock minus ours
         self.closed_reason: str | None = None  #: why it ended, once it has
         self.receiver = 0  #: identity of the receiving thread
-        self.look_ns = 0  #: when the supervisor next judges its state
+        self.look_ns = 0  #: when the supervisor next evaluates its state
 
     # Set-up and end --------------------------------------------------------------------------------------------
 
     def dial(self, dialer: Dialer) -> None:
-        """Connect; raises what the dialer raises."""
+        """Connect. Raises the dialer's errors."""
         self._end = dialer(self)
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
@@ -206,7 +206,7 @@ class ProxySession:
 
     @property
     def address(self) -> str:
-        """Address of the proxy, for people."""
+        """Human-readable address of the proxy."""
         return self._end.address if self._end is not None else "nowhere"
 
     # Sending ---------------------------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ class ProxySession:
         return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
 
     def subscribe(self, topic: str, on: bool) -> None:
-        """Subscribe to a topic or unsubscribe. Video shared by several requests is subscribed to once."""
+        """Subscribe to or unsubscribe from a topic. Video shared by several requests is subscribed to once."""
         end = self._end
         if end is None:
             return
@@ -264,15 +264,15 @@ class ProxySession:
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
         if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
-            # One ping at a time, sent once: on a stalled path, queued pings and their answers delay all others.
+            # Send one ping at a time, and only once: on a stalled path, queued pings and answers delay everything else.
             self._pinged = True
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
         """Resubscribe to feedback if it has stalled although the proxy answers.
 
-        For the rest of this session, a request in another form gives way to plain feedback: the proxy may be older, or
-        at its limit of forms. Consumers select their samples in any case.
+        If feedback was requested in another form, plain feedback replaces it for the rest of this session: the proxy
+        may be older, or have no room for more forms. Consumers select their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         end = self._end
@@ -285,7 +285,7 @@ class ProxySession:
         end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
-        """Judge the link by the new rate of feedback from now on."""
+        """Evaluate the link by the new feedback rate from now on."""
         if request == self._feedback:
             return
         now_ns, self._feedback = self._clock(), request
@@ -323,7 +323,7 @@ class ProxySession:
         if type(sample) is Feedback:
             if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
-                if not self._up:  # the first one wakes the supervisor, which reports that the link is up
+                if not self._up:  # the first sample wakes the supervisor, which reports that the link is up
                     self._up = True
                     self._poke()
             return
@@ -349,7 +349,7 @@ class ProxySession:
         self._handler.frame(header, pixels, now_ns, topic)
 
     def closed(self, reason: str) -> None:
-        """Note that the transport has closed the connection; the supervisor reconnects."""
+        """Handle a connection closed by the transport; the supervisor reconnects."""
         self.closed_reason = reason
         self._poke()
 
@@ -366,8 +366,8 @@ class ProxySession:
 def _carrier(topic: str, *, variants: bool) -> str:
     """Return the transport's topic that carries this video.
 
-    ``variants``: whether the transport carries frames in the requested form; otherwise all arrive unchanged, and each
-    channel filters and scales them itself.
+    ``variants``: whether the transport carries frames in the requested form. If not, all frames arrive unchanged, and
+    each channel filters and scales them itself.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):

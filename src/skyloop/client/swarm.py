@@ -1,4 +1,4 @@
-"""Several drones that are connected, commanded and awaited together, with a policy for failures."""
+"""Swarms: several drones connected, commanded and awaited together, with a policy for failures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OnError = Literal["continue", "raise", "stop", "land"]
 Target = str | Mapping[str, str]
 Missing = Literal["raise", "skip"]
 
-_WILD: Final = frozenset("*?[")  #: characters of a pattern
+_WILD: Final = frozenset("*?[")  #: characters that turn a name into a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _ROUNDING_S: Final = 1e-6
 _log = logging.getLogger("skyloop")
@@ -62,9 +62,9 @@ _log = logging.getLogger("skyloop")
 class Tick:
     """One iteration of :meth:`Swarm.ticks`."""
 
-    number: int  #: from 0
-    elapsed_s: float  #: since the first
-    late_s: float  #: delay after its due time
+    number: int  #: counted from 0
+    elapsed_s: float  #: time since the first tick [s]
+    late_s: float  #: delay after its due time [s]
 
 
 @explains_moved_options
@@ -77,9 +77,9 @@ def swarm(
         *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
-        on_error: Policy for the others when one fails; see :class:`Swarm`.
-        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
-            none is left.
+        on_error: What the others do when a drone fails; see :class:`Swarm`.
+        missing: How to handle drones that can't be connected: ``"raise"`` fails the call, ``"skip"`` leaves them out
+            as long as at least one drone connects.
         **options: As for :func:`skyloop.connect`, for each drone.
 
     Returns:
@@ -150,7 +150,7 @@ def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[st
 
 
 def check_policy(on_error: str) -> None:
-    """Check an ``on_error``.
+    """Check a value of ``on_error``.
 
     Raises:
         UsageError: If it is unknown.
@@ -163,7 +163,7 @@ class Swarm:
     """Drones by name, in a fixed order; returned by :func:`skyloop.swarm`. A context manager, for one thread at a time.
 
     ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all of them. A command goes to all *active* drones.
-    Failures of some never keep the others from getting it; ``on_error`` decides what follows:
+    If it fails for some, the others still get it; ``on_error`` decides what happens next:
 
     - ``"continue"``: failed drones hover and are set aside, the others continue. :attr:`errors` lists those set aside;
       a drone taken over by another application returns when its authority is given back, the others return with
@@ -172,12 +172,12 @@ class Swarm:
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.
     - ``"land"``: the others land, then :class:`SwarmError` is raised.
 
-    A drone with a lost link gets no commands, and takes part again when the link is back; unless ``on_error`` is
-    ``"continue"``, a command that could not be sent is a failure. At the end of the block, all drones land at the same
+    A drone with a lost link gets no commands, and rejoins when the link is back; a command that could not be sent
+    is a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same
     time (or hover, with ``on_exit``), including those set aside, even if some of them fail.
 
-    Commands return a dict from names to the results of the same command of :class:`Drone`. They raise
-    :class:`SwarmError` as set by ``on_error``, :class:`UsageError` for numbers that are not finite, and
+    Commands return a dict with the result of the same command of :class:`Drone` for each name. They raise
+    :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not finite, and
     :class:`ClosedError`.
     """
 
@@ -229,14 +229,14 @@ class Swarm:
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """Reasons of drones that do not take part, by name: those set aside, and those never connected."""
+        """Why drones do not take part, by name: those set aside and those that never connected."""
         return {**self.missing, **self._aside}
 
     def readmit(self, *names: str) -> None:
         """Reactivate drones that were set aside.
 
         Args:
-            *names: Names of the drones; none: all.
+            *names: Names of the drones; all of them if none is given.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names.
@@ -278,7 +278,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
@@ -291,7 +291,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
@@ -299,7 +299,7 @@ class Swarm:
     def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones.
 
-        Drones that others fly are left to them: only a drone's own ``drones[name].hover()`` takes it back.
+        Drones flown by other applications are left alone; only a drone's own ``drones[name].hover()`` takes it back.
         """
         return self.send(dict.fromkeys(self.active, Hover()))
 
@@ -354,16 +354,16 @@ class Swarm:
         paths. Drones that are set aside are left out.
 
         Args:
-            places: By name of the drone: x, y, z in its world axes [m], and optionally the yaw [rad].
+            places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
             speed: Maximum speed on the way [m/s]; None: as fast as the limits allow.
-            wait: Wait until each is there; otherwise only send the commands.
+            wait: Wait until each drone has arrived; otherwise only send the commands.
             timeout_s: How long to wait [s].
-            tolerance_m: Distance from the position that counts as there [m].
+            tolerance_m: Maximum distance from the position at arrival [m].
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
-            UsageError: If a position is invalid; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
+            UsageError: If a position is invalid; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -400,8 +400,8 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            UsageError: If an argument makes no sense; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UsageError: If an argument makes no sense; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         return_action(height_m, land)
@@ -432,8 +432,8 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone with its name, all sent together.
 
-        Drones that are set aside are left out. A hover takes no drone from others, see :meth:`hover`. :attr:`spread` is
-        the time between the first and the last command.
+        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        :attr:`spread` is the time between the first and the last command.
 
         Args:
             actions: Actions by name of the drone.
@@ -442,9 +442,9 @@ class Swarm:
             By name, True if the command was handed to the transport.
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; then nothing is sent.
-            UsageError: If an action can't be commanded or has numbers that are not finite; then nothing is sent.
-            SwarmError: As set by ``on_error``.
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
+            UsageError: If an action can't be commanded or has non-finite numbers; nothing is sent in that case.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -453,14 +453,14 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        # Wait, a few milliseconds at most, until every drone can send a set-point at once, so that none leaves later.
+        # Wait a few milliseconds at most until every drone can send a set-point at once, so that all are sent together.
         open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
             action, commands = actions[name], ready[name]._commands
-            if type(action) is Hover:  # a hover of all is no decision to take one from a safety pilot
+            if type(action) is Hover:  # hovering the swarm must not take a drone from its safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
@@ -482,13 +482,13 @@ class Swarm:
 
         Args:
             function: If it raises a :class:`SkyloopError`, its drone has failed; any other exception is re-raised here.
-            what: Name of the action in error messages; empty: the function's.
+            what: Name of the action in error messages; empty: the function's name.
 
         Returns:
             Its results by name.
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -512,7 +512,7 @@ class Swarm:
         """Request the authority over all active drones.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
             wait_s: As for :meth:`Drone.request_authority`.
             for_s: As for :meth:`Drone.request_authority`.
             takeover: As for :meth:`Drone.request_authority`.
@@ -539,7 +539,7 @@ class Swarm:
             max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -561,7 +561,7 @@ class Swarm:
 
         Raises:
             UnknownNameError: If there is no flight state of this name.
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -585,8 +585,8 @@ class Swarm:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
         Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
-        ends, by its time, a ``break``, an exception or Ctrl-C, drones that fly by its velocities or attitudes hover at
-        once, because nothing would give them newer ones.
+        ends, by its time, a ``break``, an exception or Ctrl-C, drones still flying its velocities or attitudes hover at
+        once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
@@ -629,7 +629,7 @@ class Swarm:
             errors: The exceptions, by name of the drone.
 
         Raises:
-            SwarmError: As set by ``on_error``.
+            SwarmError: Depending on ``on_error``.
         """
         if not errors:
             return
@@ -654,7 +654,7 @@ class Swarm:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self) -> dict[str, Exception]:
-        """Do the work of the block's end: land all flying drones at the same time, and close.
+        """End the block: land all flying drones at the same time, and close.
 
         Idempotent.
 
@@ -701,7 +701,7 @@ class Swarm:
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
     """Call ``function`` for each item in turn; return its results and its :class:`SkyloopError`, by name.
 
-    Any other exception is raised after all had their turn.
+    Any other exception is raised after the function has been called for every item.
     """
     results: dict[str, R] = {}
     raised: dict[str, Exception] = {}
@@ -754,7 +754,7 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
     """End all drones' flights at the same time and close them; return the errors by name.
 
-    Ctrl-C ends the wait for landings: each is still commanded, and continues without this program.
+    Ctrl-C ends the wait for landings: each landing is still commanded, and continues without this program.
     """
     return _problems(drones, lambda drone: drone._piloting.end_flight())
 
@@ -766,7 +766,7 @@ def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError |
         def ended() -> SkyloopError | None:
             try:
                 return end(drone)
-            except GivenUpError:  # no one waits for it any more
+            except GivenUpError:  # no caller is waiting for it any more
                 return None
 
         return ended
@@ -786,8 +786,8 @@ def in_parallel(
 ) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs at the same time, each in its own thread, and wait for the last.
 
-    The threads are daemons; a job that gets none runs on this one. An interrupt ends the jobs' waits for commands, see
-    :data:`skyloop.client.commands.cancelled`; their other work ends normally.
+    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt ends the jobs'
+    waits for commands, see :data:`skyloop.client.commands.cancelled`; their other work ends normally.
 
     Args:
         jobs: The jobs by name.

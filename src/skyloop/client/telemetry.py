@@ -1,4 +1,4 @@
-"""A proxy's samples at the client: the newest of each kind is stored, counted, and published to consumers."""
+"""Handle the samples that arrive from a proxy: store the newest of each kind, count them, publish them."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ from skyloop.messages.subscription import PLAIN, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-#: A condition to wait for: a flight state or its name, one of several, or a predicate on feedback.
+#: A condition to wait for: a flight state or its name, several of which any will do, or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class LinkStatus:
-    """State of the two hops, with the reason of the last change."""
+    """State of the two hops, with the reason for the last change."""
 
-    application: LinkState  #: application–proxy
-    vehicle: LinkState  #: proxy–vehicle, as last reported by the proxy
+    application: LinkState  #: hop from application to proxy
+    vehicle: LinkState  #: hop from proxy to vehicle, as last reported by the proxy
     reason: str = ""
-    remedy: str = ""  #: a remedy for the vehicle's link while it is not up
+    remedy: str = ""  #: what to do about the vehicle's link while it is not up
 
 
 class Closable(Protocol):
@@ -64,9 +64,9 @@ class Closable(Protocol):
 
 
 class Mailboxes:
-    """Mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+    """Mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
 
-    A context manager: they fill while it is open.
+    It is a context manager; the mailboxes fill while it is open.
     """
 
     def __init__(
@@ -125,14 +125,14 @@ class Mailboxes:
 
 
 class FeedbackDemand:
-    """Subscribes to the form of feedback that covers all consumers of a drone.
+    """Subscribes to the form of feedback that satisfies all consumers of a drone.
 
-    A pilot gets every complete sample, because they show its link, its authority and failsafes. So does an observer,
-    until a consumer limits its request, and whenever one needs all. A connection has one form at a time.
+    A pilot gets every sample, complete, because they show its link, its authority and failsafes. So does an observer
+    until a consumer limits its request, and whenever a consumer needs them all. A connection has one form at a time.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, this never changes."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
@@ -174,12 +174,12 @@ class FeedbackDemand:
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # first, so that no sample is missed
+            self._connection.subscribe(needed.topic, True)  # before unsubscribing, so that no sample is missed
             self._connection.subscribe(before.topic, False)
 
 
 class FeedbackChannel(Channel[Feedback]):
-    """Feedback for consumers that request fewer samples than the connection gets for others."""
+    """Feedback for consumers that need fewer samples than the connection receives for others."""
 
     def __init__(self, request: FeedbackRequest, demand: FeedbackDemand) -> None:
         super().__init__(lambda on: demand.want(request, on))
@@ -212,7 +212,7 @@ class ClientState:
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
         self.video = VideoChannels(connection, scheduler, self.history)
-        self.counter = ChannelCounter()  #: of feedback
+        self.counter = ChannelCounter()  #: counts feedback
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
         self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(PLAIN, on))
@@ -223,9 +223,9 @@ class ClientState:
         self.on_annotation: Channel[Annotation] = Channel(lambda on: connection.subscribe(ANNOTATIONS, on))
         self.on_log: Channel[LogEntry] = Channel(lambda on: connection.subscribe(LOGS, on))
         self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
-        self.overview: Overview | None = None  #: the newest complete one
+        self.overview: Overview | None = None  #: the newest complete overview
         self.on_share: Channel[ProcessorShare] = Channel()
-        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; on the supervisor's thread
+        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; published on the supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
@@ -320,7 +320,7 @@ class ClientState:
 
 
 class SessionSamples:
-    """Handles the samples and the connection changes of every session.
+    """Handles the samples and changes of the connection in every session.
 
     ``feedback``, ``frame`` and the other samples arrive on the receiving thread, the rest on the supervisor's.
     """
@@ -365,7 +365,7 @@ class SessionSamples:
         self._state.emit(EventKind.APPLICATION_LINK, text, severity, state=state.value, reason=reason)
 
     def tick(self, now_ns: int) -> int:
-        """Resubscribe to stalled cameras, and send all due packets; return when to call again [ns]."""
+        """Resubscribe to stalled cameras, and send all due packets; return when to call this again [ns]."""
         self._state.video.renew(self._connection.state is LinkState.UP, now_ns)
         return self._commands.tick(now_ns)
 
@@ -376,7 +376,7 @@ class SessionSamples:
         state.history.add(sample)
         state.newest = sample
         state.received_ns = now_ns
-        # A failsafe or another owner ends the set-point, but not the command of a listener in response to this sample.
+        # A failsafe or another owner ends the set-point, but not a command that a listener sends on this sample.
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)
@@ -431,7 +431,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition, and its name for people.
+    """Return the predicate for a condition, and its human-readable name.
 
     Raises:
         UnknownNameError: If there is no flight state of this name.

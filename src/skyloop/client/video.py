@@ -1,4 +1,4 @@
-"""Channels of video: a camera's frames for each request, and encoded streams, decoded on a thread."""
+"""Channels of video: a camera's frames for each request, and encoded streams, decoded on a separate thread."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from skyloop.transport.base import Pixels, stream, video
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-#: Pictures that may wait for decoding. Beyond that, decoding is too slow: they are skipped up to a key picture.
+#: Maximum number of pictures that wait for decoding; if decoding is slower, they are skipped up to a key picture.
 MOST_WAITING: Final = 6
-IDLE_KEPT: Final = 32  #: channels of each kind that are kept; beyond that, unread ones are forgotten
+IDLE_KEPT: Final = 32  #: maximum number of channels kept of each kind; beyond it, unread ones are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before requesting it again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
@@ -47,17 +47,17 @@ class VideoOptions(TypedDict, total=False):
 
 
 def usual(camera: str) -> VideoRequest:
-    """Return the default request: JPEG where frames travel over a network."""
+    """Return the default request: JPEG if frames are sent over a network."""
     return VideoRequest(camera, encoding="jpeg")
 
 
 class StreamOptions(TypedDict, total=False):
-    """Options for H.264; without any, as the vehicle itself encoded it."""
+    """Options for H.264; without options, pictures arrive as the vehicle itself encoded them."""
 
-    kbit_s: int | None  #: rate of an encoding by the proxy, shared by all who request the same [kbit/s]
+    kbit_s: int | None  #: rate at which the proxy encodes, once for all clients with the same request [kbit/s]
     max_fps: float | None  #: maximum pictures per second; None: all
     scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: encoded by the proxy for this subscriber alone, at the rate that its path carries
+    subscriber: str  #: the only subscriber that the proxy encodes for, at the rate that its path can carry
 
 
 class VideoChannel(Channel[Arrival]):
@@ -71,7 +71,7 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Create a channel without consumers for a request for a camera's frames; None: see :func:`usual`."""
+        """Create a channel, without consumers, for a request for a camera's frames; None: see :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
@@ -81,10 +81,10 @@ class VideoChannel(Channel[Arrival]):
         self.notifier = scheduler.notifier()  #: notified with each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
-        self.too_old = 0  #: frames that a consumer rejected by its ``max_age_s``
+        self.too_old = 0  #: number of frames rejected because of a consumer's ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         self.filter = FrameFilter(self.request)  #: selects this request's frames from the plain ones
-        self._read: Arrival | None = None  # last result of next_frame()
+        self._read: Arrival | None = None  # the last result of next_frame()
         self._connection = connection
         self._history = history
         self._clock = scheduler.clock
@@ -113,7 +113,7 @@ class VideoChannel(Channel[Arrival]):
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
         """Publish a frame received at ``now_ns``; ignore duplicates and overtaken ones.
 
-        ``as_asked``: whether the proxy made it for this request; if False, it is scaled here as needed.
+        ``as_asked``: whether the proxy prepared it for this request; if False, it is scaled here as needed.
         """
         counter = self.counter
         last = counter.last_seq
@@ -124,8 +124,8 @@ class VideoChannel(Channel[Arrival]):
             arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock)
         else:
             arrival = SmallArrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Consumers first, then the statistics. The previous frame is released last, because returning its memory to the
-        # proxy takes longer than everything else here.
+        # Consumers come first, then the statistics. The previous frame is released last, because returning its memory
+        # to the proxy takes longer than everything else here.
         before, self.newest = self.newest, arrival
         self.publish(arrival)
         self.notifier.notify()
@@ -152,7 +152,7 @@ class VideoChannel(Channel[Arrival]):
 
 
 class StreamChannel(Channel[EncodedFrame]):
-    """The whole pictures of one stream in order of arrival; some may be missing."""
+    """Delivers the whole pictures of one stream in order of arrival; some may be missing."""
 
     def __init__(self, topic: str, connection: ProxyConnection, clock: Clock) -> None:
         super().__init__(lambda on: connection.subscribe(topic, on))
@@ -160,7 +160,7 @@ class StreamChannel(Channel[EncodedFrame]):
         self.decoder: StreamDecoder | None = None  #: for consumers of decoded frames
         self._connection = connection
         self._clock = clock
-        self._encoded_here = "?" in topic  # encoded by the proxy, which needs reports of arrivals
+        self._encoded_here = "?" in topic  # whether the proxy encodes it, and so needs reports of arrivals
         self._pieces = Pieces()
         self._asked_ns = -ASK_AGAIN_NS
 
@@ -174,9 +174,9 @@ class StreamChannel(Channel[EncodedFrame]):
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Report the newest picture to the proxy, which needs it to follow the path's rate. Thread-safe.
+        """Report the newest picture to the proxy, which adapts its rate to the path by these reports. Thread-safe.
 
-        ``wants_key``: pictures can't be decoded because one is missing; requested at most some times a second.
+        ``wants_key``: pictures can't be decoded because one is missing; requests are limited to a few a second.
         """
         if not self._encoded_here:
             return
@@ -189,7 +189,7 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream in its own thread, in order. Undecodable pictures are skipped up to a key picture.
+    """Decodes one stream in its own thread, in order. If a picture can't be decoded, skips to a key picture.
 
     ``deliver`` is called on that thread with each picture: its header, its pixels in BGR, and its arrival time [ns].
     """
@@ -197,7 +197,7 @@ class StreamDecoder:
     def __init__(
         self, stream: StreamChannel, deliver: Callable[[FrameHeader, Pixels, int], None], clock: Clock, name: str
     ) -> None:
-        self.dropped = 0  #: received pictures that were not shown: after a gap, damaged, or too many at once
+        self.dropped = 0  #: received pictures not shown, because of a gap, damage, or too many at once
         self._stream = stream
         self._deliver = deliver
         self._clock = clock
@@ -246,7 +246,7 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False  # pictures after a silence of the path still follow: the decoder stays
+            self._running = False  # pictures that follow a silence still continue the stream, so the decoder stays
             return None
 
     def _leave_out(self) -> None:
@@ -281,10 +281,10 @@ class VideoChannels:
     """The channels of all cameras and their streams. Thread-safe; video arrives on the receiving thread."""
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
-        self.channels: dict[str, VideoChannel] = {}  #: by camera, for the default request
+        self.channels: dict[str, VideoChannel] = {}  #: channels for the default request, by camera
         self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
-        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to this client
+        self.subscriber = secrets.token_hex(8)  #: identifies streams whose rate is adapted to this client's path
         self._connection = connection
         self._scheduler = scheduler
         self._history = history
@@ -372,11 +372,11 @@ class VideoChannels:
         """Store the cameras of a newly connected proxy, which may count its frames from 0."""
         for channel in tuple(self.variants.values()):
             channel.restart(now_ns)
-        # The proxy may have restarted with other cameras, so that another one is the first.
+        # The proxy may have restarted with other cameras, and another one may be the first.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
-        """Resubscribe to cameras that have stalled although other samples arrive (``flows``)."""
+        """Resubscribe to cameras that have stalled while other samples arrive (``flows``)."""
         for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)

@@ -1,8 +1,8 @@
 """The contract between the proxy and a vehicle's driver. ``docs/drivers.md`` shows how to write one.
 
-A driver speaks one vehicle family's native protocol and knows nothing of the network, applications or authority. It
-converts units and axes at its edge: everything above uses SI units and body axes x forward, y left, z up. Its class is
-registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
+A driver speaks the native protocol of one vehicle family and knows nothing about the network, applications or
+authority. It converts units and axes at its edge: everything above it uses SI units and body axes x forward, y left, z
+up. Its class is registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ from skyloop.messages.parameter import Diagnostic
 class Sink(Protocol):
     """Receives a driver's feedback, frames, link states and events.
 
-    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is
-    ``time.monotonic_ns`` of this host.
+    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is a time of
+    ``time.monotonic_ns`` on this host.
     """
 
     def feedback(self, feedback: Feedback) -> None:
         """Publish the vehicle's newest state.
 
         Args:
-            feedback: The state, with the vehicle's block filled in. The proxy's fields (``seq``, ``published_ns``,
-                ``lease``, ``owner``, …) keep their defaults. An unknown number is None, never NaN.
+            feedback: The state, with the vehicle's block of fields filled in. The proxy's fields (``seq``,
+                ``published_ns``, ``lease``, ``owner``, …) keep their defaults. Unknown numbers are None, never NaN.
         """
 
     def frame(
@@ -71,22 +71,22 @@ class Sink(Protocol):
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
-            pixels: C-contiguous uint8. Raw encodings have exactly ``height * width * channels`` bytes; JPEG is one
-                file. May be reused after the call.
+            pixels: C-contiguous uint8 array, which may be reused after the call. Raw encodings have exactly
+                ``height * width * channels`` bytes; JPEG is one file.
             captured_ns: When the frame was captured, on this host's monotonic clock.
-            width: [px]
-            height: [px]
+            width: Width [px].
+            height: Height [px].
             encoding: Encoding of ``pixels``.
-            intrinsics: For this size; None if unknown.
+            intrinsics: Intrinsics for this size; None if unknown.
         """
 
     def wants(self, camera: str) -> bool:
-        """Return whether anyone uses this camera's frames at present. If not, a driver need not decode them."""
+        """Return whether this camera's frames are used at present. If not, a driver need not decode them."""
 
     def wanted_fps(self, camera: str) -> float:
         """Return how many of this camera's frames per second the most demanding consumer uses at present.
 
-        0: none; infinity: all. A driver whose frames are expensive may skip those beyond this rate.
+        0 means none, infinity means all. If frames are expensive, a driver may skip those beyond this rate.
         """
 
     def stream(
@@ -100,32 +100,32 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as the vehicle encoded it, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a picture as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        Size, time and intrinsics are those of the decoded frame. While someone uses frames, that one is also passed to
-        :meth:`frame`.
+        Size, time and intrinsics are those of the decoded frame. While frames are in use, the decoded frame is also
+        passed to :meth:`frame`.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
-            data: One access unit of H.264 in Annex B form, undamaged, from a stream without B pictures; key pictures
-                with SPS and PPS. Any other picture continues the previous one passed here: start with a key picture
-                after a gap, and after a period without receivers.
+            data: One undamaged H.264 access unit in Annex B format, from a stream without B pictures. Key pictures
+                include SPS and PPS. Any other picture must continue the previous one passed here: after a gap, or a
+                period without receivers, start with a key picture.
             captured_ns: When the picture was captured, on this host's monotonic clock.
-            width: [px]
-            height: [px]
+            width: Width [px].
+            height: Height [px].
             key: Whether decoding can start with this picture.
-            intrinsics: For this size; None if unknown.
+            intrinsics: Intrinsics for this size; None if unknown.
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether anyone receives this camera's encoded pictures at present."""
+        """Return whether this camera's encoded pictures have receivers at present."""
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
         """Report a new state of the vehicle link, or a new reason for the current one.
 
         Args:
             state: UP once the vehicle answers.
-            reason: The expected event and the last failure. Shown to every client.
+            reason: What is being waited for, and the last failure. Shown to every client.
             remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
         """
 
@@ -134,23 +134,23 @@ class Sink(Protocol):
 
         Args:
             kind: Kind of the event.
-            text: Text for people.
-            severity: Severity, for people and filters.
+            text: Human-readable text.
+            severity: Severity, for display and filters.
             **data: Data for programs.
         """
 
 
 class ServedLink(Protocol):
-    """A vehicle link served by a host, on one thread for the links of several vehicles."""
+    """A vehicle link served by a host, whose thread may serve the links of several vehicles."""
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when :meth:`serve` must be called."""
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work without waiting. Its errors have been reported already; the host retries after a pause.
+        """Do all pending work without waiting. Errors raised are already reported; the host retries after a pause.
 
         Args:
-            readable: Whether :meth:`fileno` is readable; if not, the time of the last result has come.
+            readable: Whether :meth:`fileno` is readable; if not, the time last returned has come.
 
         Returns:
             Latest time of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
@@ -160,7 +160,7 @@ class ServedLink(Protocol):
         """Release the link's resources."""
 
 
-AHEAD_NS: Final = nanoseconds(0.05)  #: a pose may be this far in the future: two hosts' clocks are not known better
+AHEAD_NS: Final = nanoseconds(0.05)  #: how far in the future a pose may be: accuracy of two hosts' clock offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class ExternalPose:
 
     Args:
         position_m: Position of the body's origin in world axes, x east, y north, z up [m].
-        quaternion: (x, y, z, w), rotates body axes (x forward, y left, z up) to world axes.
+        quaternion: Rotation (x, y, z, w) from body axes (x forward, y left, z up) to world axes.
         captured_ns: Time of the measurement, on this host's monotonic clock.
         position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
         attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
@@ -189,7 +189,7 @@ class ExternalPose:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
     def bounded(self, now_ns: int) -> ExternalPose:
-        """Return the pose with a time that is not in the future, as drivers require.
+        """Return the pose with its time limited to the present, as drivers require.
 
         Args:
             now_ns: The present time, on this host's monotonic clock.
@@ -206,16 +206,16 @@ class ExternalPose:
 class Driver(ABC):
     """Base class of drivers. It owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
 
-    No I/O happens before :meth:`open`. Times passed to the sink are ``time.monotonic_ns`` of this host. ``_open(sink)``
-    starts threads and does not wait, ``_close()`` joins them and clears all set-points, and ``_apply(action)``
-    implements :meth:`apply`. The attributes ``uri`` and ``_sink`` belong to this class.
+    No I/O happens before :meth:`open`. Times passed to the sink are from ``time.monotonic_ns`` on this host.
+    ``_open(sink)`` starts threads and does not wait, ``_close()`` joins them and clears all set-points, and
+    ``_apply(action)`` implements :meth:`apply`. The attributes ``uri`` and ``_sink`` belong to this class.
 
     Args:
         uri: The vehicle's address with its options.
 
     Attributes:
         shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is theirs and left alone.
-        parameters_without_authority: Names of parameters that any pilot may write: those that move nothing that flies.
+        parameters_without_authority: Names of parameters that any pilot may write, because they don't affect a flight.
         serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
             its own thread.
 
@@ -230,20 +230,20 @@ class Driver(ABC):
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. Subclasses read their options here, without I/O."""
         self.uri = uri
-        self.__lock = threading.Lock()  # private to this class: subclasses may have their own _lock
+        self.__lock = threading.Lock()  # private to this class, because subclasses may have their own _lock
         self._sink: Sink | None = None
 
     # Abilities ------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def capabilities(self) -> Capabilities:
-        """Return what the vehicle can do.
+        """Return the vehicle's capabilities.
 
         May be called before :meth:`open`. The proxy emulates missing actions in software where it can.
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return the vehicle's own parameters known so far, with their present values.
+        """Return those of the vehicle's own parameters that are known so far, with their present values.
 
         Names are dotted and lower-case. May be called before the vehicle has answered.
         """
@@ -262,14 +262,14 @@ class Driver(ABC):
             The value in force, which the vehicle may have rounded.
 
         Raises:
-            ParameterError: The vehicle refuses the value; the text gives its reason.
+            ParameterError: The vehicle refuses the value; the message gives its reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, sink: Sink) -> None:
-        """Start to communicate with the vehicle. Returns at once; the sink gets the state of the link.
+        """Start communicating with the vehicle. Returns at once; the state of the link is reported to the sink.
 
         An unreachable vehicle is not an error: the driver keeps trying.
 
@@ -309,21 +309,21 @@ class Driver(ABC):
         :meth:`capabilities`, and with finite numbers.
 
         Args:
-            action: A set-point or a one-time action. A take-off without telemetry is refused rather than kept for
+            action: A set-point or a one-time action. Without telemetry, a take-off is refused rather than kept for
                 later.
-            new: Whether it is a new request of an application. Otherwise it is the library's repeat or continuation of
-                an earlier request, and must not take the vehicle back from another controller.
+            new: Whether it is a new request from an application. If not, the library repeats or continues an earlier
+                request, which must not take the vehicle back from another controller.
 
         Returns:
-            The action after the vehicle's limits.
+            The action as limited by the vehicle.
 
         Raises:
-            DriverError: The vehicle can't execute it; the text is shown to people.
+            DriverError: The vehicle can't execute it; the message is shown to people.
         """
         return self._apply(action) if new else self._repeat(action)
 
     def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
-        """Refuse a request to the software autopilot that the vehicle is sure not to follow.
+        """Refuse a request to the software autopilot that the vehicle would certainly not follow.
 
         Called before the software autopilot starts an action that the vehicle does not support itself. For example, a
         vehicle that can't be armed refuses the take-off. Returns at once.
@@ -332,24 +332,24 @@ class Driver(ABC):
             action: Take-off, hover, land, velocity or position.
 
         Raises:
-            DriverError: The vehicle would not follow; the text is shown to people.
+            DriverError: The vehicle would not follow it; the message is shown to people.
         """
 
     def left_to(self) -> str:
-        """Return what others made the vehicle do since the last command from here, such as ``RTL``.
+        """Return what others have made the vehicle do since our last command, such as ``RTL``.
 
-        For vehicles that report it. The proxy asks several times a second, and leaves alone what others fly; a new
-        action takes the vehicle over and ends this. Thread-safe; returns at once.
+        Override this if the vehicle reports it. The proxy calls it several times a second, and leaves a vehicle flown
+        by others alone until a new action takes it over. Thread-safe; returns at once.
 
         Returns:
-            The driver's word for it; empty if nothing changed.
+            The driver's word for it; empty if others have done nothing.
         """
         return ""
 
     def failsafe(self, action: Hover | Land) -> bool:
         """Apply an action while no pilot is in command. Never raises.
 
-        The driver emits a failure as an event, and the proxy retries.
+        The driver reports a failure as an event, and the proxy retries.
 
         Args:
             action: Hover or land.
@@ -369,7 +369,7 @@ class Driver(ABC):
     # Abilities of some vehicles --------------------------------------------------------------------------------------
 
     def external_pose(self, pose: ExternalPose) -> None:  # noqa: ARG002
-        """Send the vehicle its pose from motion capture, for flight without GPS.
+        """Send the vehicle its own pose from motion capture, for flight without GPS.
 
         Thread-safe; returns at once.
 
@@ -402,23 +402,23 @@ class Driver(ABC):
         raise UsageError(f"{self.uri.scheme} does not support {action.name}")
 
     def _repeat(self, action: AnyAction) -> AnyAction:
-        """Apply a repeat; see :meth:`apply`. Override it where others may fly the vehicle, too."""
+        """Apply a repeat; see :meth:`apply`. Override this if others may fly the vehicle, too."""
         return self._apply(action)
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Apply a failsafe's action; see :meth:`failsafe`. Override it where that differs from a pilot's request."""
+        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it differs from a pilot's request."""
         return self._apply(action)
 
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise an error for an unknown option of the URI.
+    """Raise an error if the URI has an unknown option.
 
     Args:
         uri: The vehicle's address.
         known: Every option that the driver reads.
 
     Raises:
-        UnknownNameError: For the first option that is not in ``known``.
+        UnknownNameError: An option is not in ``known``; the message names the first.
     """
     for name in uri.options:
         if name not in known:
@@ -426,7 +426,7 @@ def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
 
 
 def checked_value(parameter: Parameter, value: Value) -> Value:
-    """Check a new value of a scalar parameter; return it, converted to float for a float parameter.
+    """Check a new value for a scalar parameter; return it, converted to float if the parameter is a float.
 
     Raises:
         ParameterError: The value is of the wrong type, out of range, or not one of the choices.

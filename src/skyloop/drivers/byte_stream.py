@@ -18,30 +18,30 @@ from skyloop.errors import MissingExtraError
 from skyloop.files import wait_readable
 
 CONNECT_S: Final = 1.0
-STUCK_NS: Final = nanoseconds(0.5)  #: a connection without room for this long counts as no longer read
-_READ_BYTES: Final = 65_536  # bytes read at once
-_BITS_PER_BYTE: Final = 10  # on a serial line for each byte
-_DRAIN_S: Final = 0.1  # time for closing a connection while a new one is to be opened
-END_S: Final = 0.5  #: the same at the final end: TCP resends a lost packet 0.2 s later
-_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection ends, so that nothing older is delivered
-_OVERDUE_NS: Final = nanoseconds(0.1)  # a line is stalled if bytes still wait this long after they were due
+STUCK_NS: Final = nanoseconds(0.5)  #: a connection whose buffer stays full for this long is considered dead
+_READ_BYTES: Final = 65_536  # maximum number of bytes per read
+_BITS_PER_BYTE: Final = 10  # bits on a serial line for each byte, with start and stop bits
+_DRAIN_S: Final = 0.1  # time limit for closing a connection before a new one is opened
+END_S: Final = 0.5  #: the same for the final close, because TCP resends a lost packet after 0.2 s
+_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection is closed, so that nothing older is delivered
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes still wait this long after their due time
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
-#: Size of the longest frame of MAVLink and MSP [bytes]. Flight controllers' parsers read as many bytes as a frame
-#: announces without looking for another frame inside, so a possibly cut frame is padded before a stop is sent.
+#: Size of the longest frame in MAVLink and MSP [bytes]. Flight controllers' parsers read as many bytes as a frame
+#: announces and don't look for another frame among them, so a frame that may be incomplete is padded before a stop.
 _LONGEST: Final = 280
 
 
 class Rank(IntEnum):
-    """Priority of a packet: the first is always sent at once, the last only on an idle line."""
+    """Priority of a packet: the first rank is always sent at once, the last only if the line is idle."""
 
     STOP = 0  #: emergency stops, which empty the output buffer of a serial port
-    COMMAND = 1  #: modes, arming: rare, small, never held back
+    COMMAND = 1  #: modes and arming, which are rare, small and never held back
     SETPOINT = 2
     QUERY = 3  #: requests, parameters
     POSE = 4  #: external poses, which are frequent and large
 
 
-#: How far the line may lag for a packet of this rank to be sent [ns].
+#: Maximum lag of the line at which packets of a rank are still sent [ns].
 _PATIENCE_NS: Final = {
     Rank.SETPOINT: nanoseconds(0.1),
     Rank.QUERY: nanoseconds(0.06),
@@ -50,31 +50,31 @@ _PATIENCE_NS: Final = {
 
 
 class LinePace:
-    """Estimates how far a line lags, so that packets are fresh on arrival. Pure.
+    """Estimates how far a line lags behind, so that packets are fresh on arrival. Pure.
 
     Args:
-        bytes_per_s: Speed of the line; None: never a bottleneck.
+        bytes_per_s: Speed of the line; None if it is never a bottleneck.
         overdue_ns: How late written bytes may be before the line counts as stalled.
     """
 
     def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
-        self._free_ns = 0  # when all written bytes will have been sent
-        self._written = 0  # bytes
-        self._mark = 0  # this many of them
-        self._due_ns: int | None = None  # should have been sent by then; None: none waited
+        self._free_ns = 0  # time by which all bytes written will have been sent
+        self._written = 0  # total number of bytes written
+        self._mark = 0  # how many of these are due at _due_ns
+        self._due_ns: int | None = None  # time by which they should have been sent; None if none were waiting
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
         """Return whether a packet may be sent now; otherwise it would queue behind others and arrive late."""
         return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
 
     def stalled(self, now_ns: int) -> bool:
-        """Return whether the line is stuck, judged by the size of the output buffer."""
+        """Return whether the line is stuck, judging by what is left in the output buffer."""
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
-        """Note how many of the bytes written are still in the output buffer."""
+        """Update with the number of bytes written that are still in the output buffer."""
         if not size:
             self._due_ns = None
         elif self._due_ns is None or self._written - size >= self._mark:
@@ -82,7 +82,7 @@ class LinePace:
         self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
-        """Note the number of bytes written."""
+        """Update with the number of bytes written."""
         self._free_ns = max(self._free_ns, now_ns) + round(size * self._ns_per_byte)
         self._written += size
 
@@ -94,21 +94,21 @@ class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
     ``dropped`` counts packets that were not sent because the line lagged, was stalled, or had no room. Drivers repeat
-    each of them, or send a newer one. This does not see the far end's own buffer, nor a pseudo-terminal's, whose size
-    the system reports as 0: sessions hold set-points back while they receive nothing.
+    each of them, or send a newer one. Buffers at the far end, and those of pseudo-terminals, which the system reports
+    as empty, are invisible here; therefore sessions hold set-points back while they receive nothing.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
         self.dropped = 0
-        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for written bytes to leave
+        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for written bytes to be sent
         self._pace = pace
         self._clock = clock
         self._stuck_ns = STUCK_NS
-        self._full_ns: int | None = None  # since when there is no room, or the line is stalled
-        self._whole = _LONGEST  # bytes written since a frame may have been cut
-        self._rest = b""  # of a frame of which only the start was written; makes the receiver discard it
-        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows yet that it is read again
-        self._after_stop = 1 << 62  # bytes written since a stop; if more than that wait, the stop is among them
+        self._full_ns: int | None = None  # when the buffer became full, or the line stalled
+        self._whole = _LONGEST  # number of bytes written since a frame may have been cut
+        self._rest = b""  # end of a frame that was only partly written, altered so that the receiver discards it
+        self._cleared = False  # a full buffer was emptied for a stop, with no sign yet that it is read again
+        self._after_stop = 1 << 62  # number of bytes written since a stop; if more are waiting, the stop is among them
 
     @abstractmethod
     def fileno(self) -> int:
@@ -130,7 +130,7 @@ class ByteStream(ABC):
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and _LONGEST < waiting <= self._after_stop:  # below that, padding takes as long
+        if stop and _LONGEST < waiting <= self._after_stop:  # with less waiting, padding takes as long
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent, whole = 0, False
@@ -156,9 +156,9 @@ class ByteStream(ABC):
     def _rest_of(self, packet: bytes, sent: int) -> bytes:
         """Return the bytes to write before the next packet: the end of a frame whose start was sent.
 
-        By then the frame is old. Its last byte, part of a checksum, is inverted so that the receiver discards it;
-        without its end, the receiver would take the next packet for the missing part. (A vehicle that ignores
-        signatures executes a signed frame that was cut within its signature.)
+        That frame is outdated. Its last byte, part of a checksum, is inverted so that the receiver discards it; without
+        the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores signatures
+        still executes a signed frame if only its signature was cut.)
         """
         if sent <= len(self._rest):
             return self._rest[sent:]
@@ -182,17 +182,17 @@ class ByteStream(ABC):
             raise ConnectionError(_NOT_READ)
 
     def _waiting(self) -> int:
-        """Return how many bytes are in the output buffer; 0 where unavailable."""
+        """Return the number of bytes in the output buffer; 0 if unavailable."""
         return 0
 
     def _discard(self) -> bool:
-        """Empty the output buffer, which may cut a frame; return whether that worked, as far as known."""
+        """Empty the output buffer, which may cut a frame; return whether, as far as is known, it worked."""
         return False
 
     def _drain(self) -> bool:
-        """Wait a moment for written bytes to leave; return whether they did."""
+        """Wait briefly until written bytes have been sent; return whether they have."""
         until_s = time.monotonic() + self.drain_s
-        # On a stuck line only a stop is worth waiting for: the buffer was emptied for it, so it may still leave.
+        # On a stuck line only a stop is worth waiting for: the buffer was emptied for it, so it may still be sent.
         patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
         while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -200,7 +200,7 @@ class ByteStream(ABC):
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
-        """Write as many bytes as fit and return their number; raise BlockingIOError if none do."""
+        """Write as many bytes as fit and return their number; raise BlockingIOError if none fit."""
 
     @abstractmethod
     def close(self) -> None:
@@ -208,15 +208,15 @@ class ByteStream(ABC):
 
 
 class TcpStream(ByteStream):
-    """A TCP connection to a numeric address (a name look-up would block). A connected server may not serve yet.
+    """A TCP connection to a numeric address, because a name look-up would block. The server may not be serving yet.
 
     Raises:
-        OSError: No connection within :data:`CONNECT_S`.
+        OSError: The connection was not made within :data:`CONNECT_S`.
     """
 
     def __init__(self, host: str, port: int, clock: Clock = monotonic_ns) -> None:
         super().__init__(LinePace(None, _TCP_OVERDUE_NS), clock)
-        self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # a packet that is lost twice takes 0.6 s
+        self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # TCP needs 0.6 s for a packet that is lost twice
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # missing on macOS
@@ -252,7 +252,7 @@ class TcpStream(ByteStream):
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone, where unreceived bytes still count
+            self._socket.getpeername()  # raises if the connection is gone, as unreceived bytes would still be counted
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -285,7 +285,7 @@ class SerialStream(ByteStream):
         """Return the received bytes, possibly none."""
         if not wait_readable(self, 0.0):
             return b""
-        data = os.read(self.fileno(), _READ_BYTES)  # pyserial's waits in select.select: only descriptors below 1024
+        data = os.read(self.fileno(), _READ_BYTES)  # pyserial's read() uses select.select: only descriptors below 1024
         if not data:
             raise ConnectionError("the port was unplugged, or another program reads it")
         return data
@@ -309,13 +309,13 @@ class SerialStream(ByteStream):
         return False
 
     def close(self) -> None:
-        """Close the port and discard unread data, for which the system would otherwise wait, on some ports for 30 s."""
+        """Close the port and discard unread data; otherwise the system would wait for it, on some ports for 30 s."""
         if not self._drain():
             self._discard()
         self._port.close()
 
 
 def line_speed(path: str, baud: int) -> float | None:
-    """Return a serial port's speed in bytes per second; None for USB, where the bit rate means nothing."""
+    """Return a serial port's speed in bytes per second; None for USB, where the bit rate is meaningless."""
     device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS_PER_BYTE

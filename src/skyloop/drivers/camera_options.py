@@ -1,8 +1,8 @@
-"""Camera options of a vehicle's address: the video's source, and the intrinsics.
+"""Camera options in a vehicle's address: the video source, and the intrinsics.
 
-The video's source is the address of a stream or a device, opened by FFmpeg. The intrinsics are either ``calibration``,
-the name of a calibration file, or the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1, p2[,
-k3[, k4, k5, k6]]).
+The video source is the address of a stream, or a device; FFmpeg opens it. The intrinsics are given by ``calibration``,
+the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1,
+p2[, k3[, k4, k5, k6]]).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
 DEVICE_FORMAT: Final = "v4l2"
-RTP_PORT: Final = 5600  #: the port of PX4, ArduPilot's companions and QGroundControl
+RTP_PORT: Final = 5600  #: the default port of PX4, ArduPilot's companion computers and QGroundControl
 _PAYLOAD: Final = 96  # GStreamer's default for rtph264pay and rtph265pay
 _RTP_OPTIONS: Final = frozenset({"payload", "codec"})
 _CODECS: Final = {"h264": "H264", "h265": "H265"}
-#: FFmpeg probes as little as possible before the first picture: the frame rate is not needed.
+#: Options that minimise FFmpeg's probing before the first picture, because the frame rate is not needed.
 _LIVE: Final = {"fpsprobesize": "0"}
-#: How long to wait for a late packet before later ones are used: a few pictures of a radio link.
+#: How long to wait for a late packet before using later ones: a few pictures' time on a radio link.
 _REORDER: Final = {"max_delay": "50000", "reorder_queue_size": "100"}
 _RTSP: Final = {**_LIVE, "allowed_media_types": "video"}
 _WAYS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -47,13 +47,13 @@ class CameraSource:
     name: str = field(repr=False)  #: address or path, with its secrets
     scheme: str  #: scheme of the address; empty for a device
     options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's options
-    sdp: str = ""  #: RFC 4566, for a session without a server to describe it
-    fallback: Mapping[str, str] | None = None  #: options for a server that refuses the first protocol
-    loses: bool = False  #: parts of pictures may get lost unnoticed
+    sdp: str = ""  #: session description (RFC 4566), if there is no server to provide it
+    fallback: Mapping[str, str] | None = None  #: options to retry with if the server refuses the first protocol
+    loses: bool = False  #: whether parts of pictures may get lost unnoticed
 
     @property
     def host(self) -> str | None:
-        """The host to look up; None if there is none, or packets may come from any host."""
+        """The host to look up; None if there is none or packets may come from any host."""
         return None if self.scheme in ("", *_LISTENING) else urlsplit(self.name).hostname
 
     @property
@@ -72,10 +72,10 @@ def source_of(text: str, where: str) -> CameraSource:
 
     Args:
         text: The address, or a device's path.
-        where: Names the address at the start of error messages.
+        where: Name of the address, which begins error messages.
 
     Raises:
-        UsageError: The text is neither a supported stream's address nor a device.
+        UsageError: The text is neither the address of a supported stream nor a device.
     """
     scheme, separator, _ = text.partition("://")
     if not separator and Path(text).is_relative_to("/dev"):
@@ -97,7 +97,7 @@ def source_of(text: str, where: str) -> CameraSource:
 
 
 def _sdp_of(text: str, where: str) -> str:
-    """Return the SDP of RTP sent to a port of this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``.
+    """Return the SDP for RTP sent to a port of this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``.
 
     Raises:
         UsageError: The address or an option makes no sense.
@@ -131,7 +131,7 @@ INTRINSICS_OPTIONS: Final = frozenset({"calibration", "fx", "fy", "cx", "cy", "d
 
 
 def check_intrinsics(uri: VehicleUri) -> None:
-    """Check the intrinsics of an address.
+    """Check the intrinsics in an address.
 
     Raises:
         UsageError: An option makes no sense, options contradict each other, or the calibration can't be read.
@@ -147,11 +147,11 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
 
     Args:
         uri: The vehicle's address.
-        width: [px]
-        height: [px]
+        width: Width [px].
+        height: Height [px].
 
     Returns:
-        None unless the address gives the focal length, or a calibration for frames of this shape.
+        The intrinsics; None unless the address gives the focal length, or a calibration for this aspect ratio.
 
     Raises:
         UsageError: An option makes no sense, options contradict each other, or the calibration can't be read.

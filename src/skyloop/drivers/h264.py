@@ -13,15 +13,15 @@ from skyloop.errors import DecodeError
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
-MAX_SETS: Final = 8  #: remembered parameter sets of each kind; cameras send one
+MAX_SETS: Final = 8  #: maximum number of parameter sets stored of each kind; cameras send one
 _ANY_START: Final = re.compile(rb"\x00\x00\x01")
-_HEADER_BYTES: Final = 32  # more than the start of a slice header needs
-_SET_BYTES: Final = 512  # more than a sequence parameter set needs, scaling lists included
+_HEADER_BYTES: Final = 32  # enough for the start of a slice header
+_SET_BYTES: Final = 512  # enough for a sequence parameter set, including scaling lists
 _CHROMA_PROFILES: Final = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128})
-_ALL_COLOURS: Final = 3  # chroma_format_idc of 4:4:4
-_MAX_BLOCKS: Final = 1024  # per side, 16384 pixels
+_ALL_COLOURS: Final = 3  # chroma_format_idc for 4:4:4
+_MAX_BLOCKS: Final = 1024  # maximum number of macroblocks per side, 16384 pixels
 _MAX_CYCLE: Final = 255
-_B: Final = 1  # slice_type, modulo 5
+_B: Final = 1  # slice_type of B slices, modulo 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,9 @@ class Sequence:
     frame_number_bits: int
     width: int  #: width of the displayed picture [px]
     height: int
-    interlaced: bool = False  #: pictures may be fields
-    colour_planes: bool = False  #: the colour planes are coded separately
-    gaps_allowed: bool = False  #: in picture numbers, where a sender leaves some out
+    interlaced: bool = False  #: whether pictures may be fields
+    colour_planes: bool = False  #: whether the colour planes are coded separately
+    gaps_allowed: bool = False  #: whether the sender may leave out pictures, so that their numbers have gaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +41,14 @@ class Slice:
     """The start of a slice header."""
 
     is_key: bool
-    is_first: bool  #: first slice of its picture
+    is_first: bool  #: whether it is the first slice of its picture
     is_reference: bool
     frame_number: int
-    is_b: bool = False  #: may refer to later pictures
+    is_b: bool = False  #: whether it may refer to later pictures
 
 
 def units(stream: bytes) -> list[bytes]:
-    """Return the NAL units of stream data in Annex B form. Bytes before the first start code are skipped."""
+    """Return the NAL units in stream data in Annex B format. Bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -118,7 +118,7 @@ def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """Skip the picture order count, of any of its three types."""
+    """Skip the fields for the picture order count, which has three types."""
     kind = bits.exp_golomb()
     if kind == 0:
         bits.exp_golomb()
@@ -165,38 +165,39 @@ class _Bits:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """An access unit, and the inspector's findings."""
+    """An access unit with the inspector's findings."""
 
-    data: bytes  #: in Annex B form; a key picture with its parameter sets
-    is_key: bool  #: decoding can start here: an IDR picture with known parameter sets
-    after_gap: bool  #: pictures are missing before this one, or it is the first
-    width: int  #: [px]
+    data: bytes  #: the unit in Annex B format; a key picture includes its parameter sets
+    is_key: bool  #: whether decoding can start here: it is an IDR picture with known parameter sets
+    after_gap: bool  #: whether pictures are missing before this one, or it is the first
+    width: int  #: width [px]
     height: int
     reason: str = ""  #: why pictures of this stream can't be forwarded undecoded; empty if they can
 
 
 class Inspector:
-    """Inspects the access units of one stream, in order and without decoding.
+    """Inspects the access units of one stream in order, without decoding them.
 
     It remembers parameter sets, which a stream may send only once, and puts them in front of each key picture. If a
     stream has several sequence parameter sets, the last one counts.
 
     Args:
-        parameters: Parameter sets from outside the stream (SDP or a container), in Annex B form.
+        parameters: Parameter sets from outside the stream (SDP or a container), in Annex B format.
     """
 
     def __init__(self, parameters: bytes = b"") -> None:
-        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # for each type, by start of the unit
+        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # by type and number of the set
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         for unit in units(parameters):
             self._remember(unit)
 
     def inspect(self, data: bytes) -> Unit | None:
-        """Inspect the next access unit, in Annex B form.
+        """Inspect the next access unit, in Annex B format.
 
         Returns:
-            None if it holds no picture, or its headers are damaged or unknown; then the next one follows a gap.
+            The unit; None if it holds no picture, or if its headers are damaged or unknown. In that case, the next unit
+            is marked as following a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}
@@ -222,7 +223,7 @@ class Inspector:
         return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
 
     def restart(self) -> None:
-        """Note that pictures were left out: the next one does not continue the last."""
+        """Record that pictures were left out, so that the next one does not continue the last."""
         self._before = None
 
     def _is_missing(self, before: Slice, now: Slice) -> bool:
@@ -243,7 +244,7 @@ class Inspector:
             try:
                 sequence = parse_sequence(unit)
             except DecodeError:
-                return  # a damaged set: the previous one counts, and the decoder decides
+                return  # the set is damaged, so the previous one stays in use and the decoder decides
             if sequence != self._sequence:
                 self._sequence, self._before = sequence, None
                 for known in self._sets.values():
@@ -256,7 +257,7 @@ class Inspector:
 
 
 def _set_number(unit: bytes) -> bytes:
-    """Return the number of a parameter set, the key it is stored under."""
+    """Return the number of a parameter set, which is the key it is stored under."""
     bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
     try:
         return bytes([bits.exp_golomb() % 256])

@@ -1,7 +1,7 @@
-"""A camera on the network or a device of this machine, opened with PyAV on start.
+"""A network camera or a camera device of this machine, opened with PyAV on start.
 
-It publishes frames, and forwards H.264 undecoded: at once if nothing can have been lost on the way, otherwise only
-after a decoder that rejects damage has decoded it.
+It publishes frames, and forwards H.264 undecoded: at once if nothing can have been lost in transit, otherwise only
+after a decoder that rejects damage has accepted it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 if TYPE_CHECKING:
     from skyloop.drivers.live_container import ContainerStream
 
-STALLED_S: Final = 1.5  #: a stream silent for this long, or for three of its periods, is reopened
+STALLED_S: Final = 1.5  #: a stream that is silent for this long, or for three of its periods, is reopened
 _WHERE: Final = "camera"  # source of the events
-OPEN_S: Final = 5.0  #: time for connecting, the handshake and the first picture
+OPEN_S: Final = 5.0  #: time limit for connecting, the handshake and the first picture
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +35,12 @@ class LiveCameraSettings:
 
     source: CameraSource
     name: str
-    width: int  #: [px]
+    width: int  #: width [px]
     height: int
     fps: float
     stream: bool = True  #: whether its H.264 is forwarded undecoded
-    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's options besides size and rate
-    purpose: str = "a camera"  #: the use of PyAV, for error messages
+    device_options: dict[str, str] = field(default_factory=dict)  #: options for FFmpeg besides size and rate
+    purpose: str = "a camera"  #: what PyAV is needed for, for error messages
 
 
 class LiveCamera:
@@ -50,7 +50,7 @@ class LiveCamera:
         settings: The camera's settings.
         sink: The proxy's sink.
         intrinsics: Returns the intrinsics for a width and height.
-        configure: Called on the reading thread with an opened device's path; returns the settings that failed.
+        configure: Called on the reading thread with the path of an opened device; returns the settings that failed.
         absent: Returns the error text for a missing device.
         on_event: Called with each event and its text, on either thread; None: events go to the sink.
     """
@@ -71,7 +71,7 @@ class LiveCamera:
         self._intrinsics = intrinsics
         self._configure = configure
         self._absent = absent
-        self._checks = settings.source.loses  # whether pictures are decoded before they are forwarded
+        self._checks = settings.source.loses  # whether pictures are decoded before being forwarded
         self._stopped = False
         self._reported: list[str] = []
         relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
@@ -98,7 +98,7 @@ class LiveCamera:
         self._video.stop()
 
     def telemetry(self) -> dict[str, Value]:
-        """Return the counters of :class:`skyloop.drivers.live_video.VideoCounters` under ``camera.``."""
+        """Return the counters of :class:`skyloop.drivers.live_video.VideoCounters`, with the prefix ``camera.``."""
         return self._video.counters.telemetry("camera")
 
     # On the reading thread ---------------------------------------------------------------------------------------

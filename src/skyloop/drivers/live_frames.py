@@ -1,4 +1,4 @@
-"""Frames of a live stream on arrival: which are decoded and shown, and which are forwarded undecoded."""
+"""Decide which of a live stream's frames to decode and show, and which to forward undecoded."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from skyloop.messages import EventKind, Intrinsics, Severity
 from skyloop.messages.frame import Chain
 
 LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
-MAX_FRAMES: Final = 120  #: 4 s; key frames of the vehicles are half a second or a second apart
-KEYLESS: Final = 600  #: pictures without a key picture before the stream is reported as not forwardable
+MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
+KEYLESS: Final = 600  #: number of pictures without a key picture after which a stream is reported as not forwardable
 
 
 @dataclass(frozen=True, slots=True)
 class Coded:
     """An encoded frame on arrival."""
 
-    data: object  #: input of the vehicle's decoder
+    data: object  #: input for the vehicle's decoder
     is_key: bool  #: whether decoding can start here
-    captured_ns: int  #: on this host's clock
+    captured_ns: int  #: capture time, on this host's clock
     arrived_ns: int
-    connection: int  #: grows with each connection; frames never refer to another connection's
+    connection: int  #: increases with each connection; frames never refer to those of another connection
 
 
 class FrameBacklog:
-    """Frames in the order of arrival, at most :data:`MAX_FRAMES`. The newest wins.
+    """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest wins.
 
     While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, frames
     before the newest key frame are dropped; the rest must all be decoded, as each refers to the previous one, but only
     the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
-    subscriber sees one at once.
+    subscriber gets an image at once.
 
     ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
     """
 
     def __init__(self) -> None:
         self.skipped = 0
-        self._frames: deque[tuple[Coded, bool]] = deque()  # and whether it was wanted on arrival
+        self._frames: deque[tuple[Coded, bool]] = deque()  # frames, and whether each was wanted on arrival
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -51,11 +51,11 @@ class FrameBacklog:
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
-            self._drop(1)  # frames that refer to it wait for the next key frame, as after any loss
+            self._drop(1)  # frames that refer to it are lost up to the next key frame, as after any loss
         self._frames.append((frame, wanted))
 
     def take(self, now_ns: int) -> tuple[Coded, bool]:
-        """Remove the frame to decode next.
+        """Remove and return the frame to decode next.
 
         Args:
             now_ns: The present time, on the clock of ``arrived_ns``.
@@ -84,9 +84,9 @@ class FrameBacklog:
 
 
 class StreamRelay:
-    """Forwards H.264 while someone wants it, starting with a key picture, and after a gap with the next one.
+    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
 
-    It does not matter whether pictures are also decoded. Not thread-safe.
+    Whether pictures are also decoded makes no difference. Not thread-safe.
     """
 
     def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
@@ -96,7 +96,7 @@ class StreamRelay:
         self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
 
     def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, it restarts later with a key picture."""
+        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
         wanted = self._sink.wants_stream(camera)
         if not wanted:
             self.restart()
@@ -119,12 +119,12 @@ class StreamRelay:
         """Forward a picture if it is wanted and can be decoded after the last one.
 
         Args:
-            camera: The camera that the vehicle shows at present.
+            camera: The camera whose video the vehicle is sending.
             unit: The picture, undamaged.
-            captured_ns: As in the decoded frame.
-            number: Number of the picture within the connection; left-out pictures leave gaps.
+            captured_ns: Capture time, the same as in the decoded frame.
+            number: Number of the picture within the connection; pictures left out cause gaps.
             connection: Number of the connection.
-            picture: False for parameters alone, which are not forwarded.
+            picture: False if there are only parameters, which are not forwarded.
 
         Returns:
             Whether the picture was forwarded.
@@ -150,7 +150,7 @@ class StreamRelay:
 
 
 class CheckedRelay:
-    """Forwards the H.264 of a camera with an unknown stream, and reports once why it can't.
+    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
 
     Not thread-safe.
     """
@@ -160,7 +160,7 @@ class CheckedRelay:
         self._sink = sink
         self._camera = camera
         self._where = where
-        self._refused = (-1, "")  # connection, and reason
+        self._refused = (-1, "")  # number of the connection, and the reason
         self._waited = 0
         self._reported = ""
 
@@ -173,9 +173,9 @@ class CheckedRelay:
         """Forward an undamaged picture; see :meth:`StreamRelay.take`.
 
         Args:
-            unit: The picture; None: its headers are unknown.
+            unit: The picture; None if its headers are unknown.
             reason: Why it can't be forwarded, for the rest of the connection; empty if it can.
-            captured_ns: As in the decoded frame.
+            captured_ns: Capture time, the same as in the decoded frame.
             number: Number of the picture within the connection.
             connection: Number of the connection.
         """

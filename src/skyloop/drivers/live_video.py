@@ -1,7 +1,7 @@
-"""Receives a vehicle's live video, decodes it, and shows the newest picture.
+"""Receive a vehicle's live video, decode it, and show the newest picture.
 
-One thread reads frames from the socket as they arrive, so that no picture ages in a kernel buffer, and keeps
-reconnecting. The other decodes wanted frames. Between them, the
+One thread reads frames from the socket as they arrive, so that pictures don't age in a kernel buffer, and keeps
+reconnecting. Another one decodes the frames that are wanted. Between them, the
 :class:`~skyloop.drivers.live_frames.FrameBacklog` decides which frames to drop when decoding is late.
 """
 
@@ -22,17 +22,17 @@ from skyloop.drivers.live_frames import Coded, FrameBacklog
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
-RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between connection attempts; the last one repeats
-REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; one may be a flipped bit
+RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
+REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
 
 
 class Decoded(NamedTuple):
     """A decoded picture."""
 
-    number: int  #: number of the vehicle's picture
+    number: int  #: number that the vehicle gave the picture
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    captured_ns: int | None = None  #: None: as for the frame decoded last
+    captured_ns: int | None = None  #: capture time; None: that of the frame decoded last
 
 
 class Stream(Protocol):
@@ -40,11 +40,11 @@ class Stream(Protocol):
 
     @property
     def broken(self) -> int:
-        """Frames that were incomplete or stale."""
+        """Number of frames that were incomplete or stale."""
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes outside whole frames."""
+        """Number of bytes outside whole frames."""
 
     def read(self) -> list[Coded]:
         """Return the received frames.
@@ -63,17 +63,17 @@ class Decoder(Protocol):
 
     @property
     def waited(self) -> int:
-        """Frames left out because their reference was never received, or a newer one had been shown."""
+        """Number of frames left out, because their reference was missing or a newer frame had been shown."""
 
     @property
     def damaged(self) -> int:
-        """Frames that could not be decoded."""
+        """Number of frames that could not be decoded."""
 
     def restart(self) -> None:
-        """Forget the stream so far: the next frame does not continue it."""
+        """Forget the stream so far, which the next frame does not continue."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame. Raises nothing else, whatever the frame contains.
+        """Decode a frame. Whatever it contains, no other errors are raised.
 
         Args:
             coded: The frame.
@@ -89,13 +89,13 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture of the vehicle's selected camera."""
+    """A picture from the vehicle's selected camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    width: int  #: [px]
+    width: int  #: width [px]
     height: int
-    captured_ns: int  #: on this host's monotonic clock; the arrival time for vehicles without timestamps
-    number: int  #: number of the vehicle's picture, 32 bits
+    captured_ns: int  #: capture time on this host's monotonic clock; arrival time if the vehicle sends no timestamps
+    number: int  #: number that the vehicle gave the picture, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
         """Publish the picture as a frame of a camera."""
@@ -103,11 +103,11 @@ class Picture:
 
 
 class VideoEvent(Enum):
-    """A receiver's reports other than pictures."""
+    """What a receiver reports besides pictures."""
 
-    STREAMING = "streaming"  #: frames arrive
-    LOST = "lost"  #: no connection, or no longer; reported once for each reason, retried for ever
-    UNSUPPORTED = "unsupported"  #: frames use another codec, or are noise; reported once for each run of them
+    STREAMING = "streaming"  #: frames are arriving
+    LOST = "lost"  #: there is no connection any more, or none yet; reported once per reason, and retried forever
+    UNSUPPORTED = "unsupported"  #: frames use another codec, or are noise; reported once per series
     FAULT = "fault"  #: an error of this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
@@ -126,22 +126,22 @@ _EVENTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class VideoCounters:
-    """Counts of frames over all connections, by what happened to them."""
+    """Counts of frames in all connections, by what happened to them."""
 
     received: int = 0
-    frames: int = 0  #: shown
-    waited: int = 0  #: left out up to the next key frame, or because a newer one had been shown
-    damaged: int = 0  #: cut off, stale at the start of a connection, or undecodable
-    refused: int = 0  #: of an unsupported kind
-    skipped: int = 0  #: wanted, but newer ones had arrived
-    lost_bytes: int = 0  #: outside whole frames
-    reconnects: int = 0  #: connections with frames, after the first such
+    frames: int = 0  #: frames shown
+    waited: int = 0  #: frames left out up to the next key frame, or because a newer one had been shown
+    damaged: int = 0  #: frames cut off, stale at the start of a connection, or undecodable
+    refused: int = 0  #: frames of an unsupported kind
+    skipped: int = 0  #: frames that were wanted, but overtaken by newer ones
+    lost_bytes: int = 0  #: bytes outside whole frames
+    reconnects: int = 0  #: connections that delivered frames, not counting the first
 
     def telemetry(self, of: str) -> dict[str, Value]:
         """Return the counters for feedback's ``native``.
 
         Args:
-            of: Prefix of the names, before a dot.
+            of: Prefix of the names, followed by a dot.
         """
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
@@ -149,22 +149,22 @@ class VideoCounters:
 class LiveVideo:
     """The video of one vehicle.
 
-    While no one wants pictures, nothing is decoded, but the stream is read and the frames since its newest key frame
+    While no pictures are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame
     are kept, so that a new subscriber gets a picture at once. No I/O happens before :meth:`start`.
 
     Args:
-        place: The video's source, for people.
+        place: Human-readable name of the video's source.
         connect: Opens a connection, given its number from 0; raises OSError on failure. On the reading thread.
         make_decoder: Creates the decoder; raises MissingExtraError if none is installed. On the thread of
             :meth:`start`.
         show: Called with each picture on the decoding thread; must return quickly.
         on_event: Called with each event and its text on either thread; must return quickly.
-        wants: Whether anyone wants pictures. Called on the reading thread.
-        wants_checked: Whether to decode frames even though no one wants pictures, because the decoder forwards whole
-            ones. Called on the reading thread.
-        came: Called with every whole frame on arrival, on the reading thread.
-        clock: Monotonic, ns.
-        name: Name of the reading thread, and prefix of the decoding thread's.
+        wants: Returns whether pictures are wanted. Called on the reading thread.
+        wants_checked: Returns whether to decode frames even if pictures aren't wanted, because the decoder forwards
+            whole ones. Called on the reading thread.
+        came: Called on the reading thread with every whole frame as it arrives.
+        clock: A monotonic clock [ns].
+        name: Name of the reading thread, and prefix of the decoding thread's name.
     """
 
     def __init__(
@@ -193,10 +193,10 @@ class LiveVideo:
         self._clock = clock
         self._name = name
         self._stop = threading.Event()
-        self._changed = threading.Condition()  # guards the backlog and the reading thread's counts
+        self._changed = threading.Condition()  # guards the backlog and the counts of the reading thread
         self._backlog = FrameBacklog()
-        self._wanted = False  # when the last frame arrived
-        self._shows = False  # pictures are wanted, not only decoding for the check
+        self._wanted = False  # whether frames were wanted when the last one arrived
+        self._shows = False  # whether pictures are wanted, rather than only decoded for the check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -218,7 +218,7 @@ class LiveVideo:
     def stop(self) -> None:
         """Stop both threads. Idempotent; no callback runs afterwards, unless this is called from one.
 
-        Takes up to 4 s; a connection that takes longer to open or read is left to end unseen.
+        Takes up to 4 s; a connection that takes longer to open or read is abandoned to end by itself.
         """
         self._stop.set()
         with self._changed:
@@ -267,7 +267,7 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """Serve one connection from start to end."""
+        """Serve one connection from its start to its end."""
         stream = self._connect(self._connections)
         with self._changed:
             self._stream = stream
@@ -332,7 +332,7 @@ class LiveVideo:
                     self._emit(VideoEvent.FAULT, reported)
 
     def _next(self) -> tuple[Coded, bool] | None:
-        """Wait for a frame while pictures are wanted. Return it and whether to show it; None after :meth:`stop`."""
+        """Wait until there is a frame to decode. Return it and whether to show it; None after :meth:`stop`."""
         with self._changed:
             self._changed.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             if self._stop.is_set():

@@ -1,4 +1,4 @@
-"""A sink for tests that keeps a driver's reports, and checks of samples and parameter values."""
+"""For tests: a sink that keeps a driver's reports, and checks for samples and parameter values."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class SeenFrame:
 
     Args:
         camera: Name of the camera.
-        pixels: A copy, uint8, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if it was
+        pixels: A copy, uint8, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if the frame was
             malformed or pixels are not kept.
-        captured_ns: As passed by the driver.
-        arrived_ns: Time of the call. Both are on this host's monotonic clock.
-        width: [px]
-        height: [px]
+        captured_ns: Capture time as passed by the driver, on this host's monotonic clock.
+        arrived_ns: Time of the call, on the same clock.
+        width: Width [px].
+        height: Height [px].
         encoding: Encoding of the pixels.
-        intrinsics: As passed by the driver.
+        intrinsics: Intrinsics as passed by the driver.
     """
 
     camera: str
@@ -57,7 +57,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A picture as the vehicle encoded it, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
+    """A picture as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
@@ -81,13 +81,13 @@ class SeenEvent:
 class RecordingSink:
     """A :class:`skyloop.drivers.base.Sink` that keeps recent samples and frames and all link states.
 
-    ``problems`` lists violations of the contract of :class:`skyloop.drivers.base.Sink`, in words. Thread-safe.
+    ``problems`` describes violations of the contract of :class:`skyloop.drivers.base.Sink`. Thread-safe.
 
     Args:
         watch: Names of the cameras whose frames are wanted; None: all.
-        keep: How many feedback samples, frames, pictures and events are kept; at most 64 frames with pixels.
-        keep_pixels: Whether frames keep a copy of their pixels.
-        record: Whether encoded pictures are wanted, of every camera.
+        keep: How many feedback samples, frames, pictures and events to keep; at most 64 frames with pixels.
+        keep_pixels: Whether to keep a copy of each frame's pixels.
+        record: Whether encoded pictures are wanted, from every camera.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class RecordingSink:
         self.feedbacks: deque[Feedback] = deque(maxlen=keep)
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
-        self.remedy = ""  #: remedy in the newest link state
+        self.remedy = ""  #: the remedy reported with the newest link state
         self.events: deque[SeenEvent] = deque(maxlen=keep)
         self.problems: list[str] = []
         self.calls = 0
@@ -112,7 +112,7 @@ class RecordingSink:
     # Called by the driver ------------------------------------------------------------------------------------------
 
     def feedback(self, feedback: Feedback) -> None:
-        """Keep a sample, and note a problem if its time is in the future or runs backwards."""
+        """Keep a sample; record a problem if its time is in the future or goes backwards."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time("feedback", feedback.captured_ns, now_ns)
@@ -131,7 +131,7 @@ class RecordingSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep a frame, and note a problem if its time or its pixels break the contract."""
+        """Keep a frame; record a problem if its time or its pixels break the contract."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"frame of {camera}", captured_ns, now_ns)
@@ -142,11 +142,11 @@ class RecordingSink:
             self._notify()
 
     def wants(self, camera: str) -> bool:
-        """Return whether the camera is in ``watch``, or True if that is None."""
+        """Return whether the camera is in ``watch``; True if that is None."""
         return self.watch is None or camera in self.watch
 
     def wanted_fps(self, camera: str) -> float:
-        """Return infinity for a camera that is watched, 0 for any other."""
+        """Return infinity for a watched camera, 0 for any other."""
         return math.inf if self.wants(camera) else 0.0
 
     def stream(
@@ -160,7 +160,7 @@ class RecordingSink:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep an encoded picture, and note a problem if it is not Annex B, or the first is not a key picture."""
+        """Keep an encoded picture; record a problem if it isn't in Annex B format, or the first isn't a key picture."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"encoded frame of {camera}", captured_ns, now_ns)
@@ -205,7 +205,7 @@ class RecordingSink:
 
         Args:
             condition: Called after each of the driver's calls, with the sink's lock held.
-            timeout_s: [s]
+            timeout_s: How long to wait [s].
 
         Returns:
             Whether the condition held; False after the time-out.
@@ -253,7 +253,7 @@ class RecordingSink:
         return pixels.reshape((height, width, 3) if channels == 3 else (height, width)).copy()
 
 
-#: Plausible range of each number of feedback: outside it, the number most likely has the wrong unit.
+#: Plausible range of each number in feedback; a number outside it most likely has the wrong unit.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "battery": (0.0, 1.0),
     "battery_v": (0.0, 60.0),
@@ -275,7 +275,7 @@ def implausible(feedback: Feedback) -> list[str]:
         feedback: The sample.
 
     Returns:
-        The problems in words; empty if there are none.
+        Descriptions of the problems; empty if there are none.
     """
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
@@ -310,7 +310,7 @@ def mismatch(parameter: Parameter, value: Value) -> str:
         value: The value to check.
 
     Returns:
-        The predicate of a sentence about the value; empty if it fits.
+        A predicate for a sentence about the value; empty if it fits.
     """
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
@@ -348,7 +348,7 @@ def another_value(parameter: Parameter) -> Value:
 def _another_number(value: float, parameter: Parameter) -> float:
     low, high = parameter.minimum, parameter.maximum
     if low is not None and high is not None:
-        if parameter.type is ParameterType.INT:  # the next one: a vehicle may accept only some values of a wide range
+        if parameter.type is ParameterType.INT:  # an adjacent one, as a vehicle may accept only part of a wide range
             return value + 1 if value < high else value - 1
         return (value + low + high) / 3
     if high is not None:

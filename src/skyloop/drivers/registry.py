@@ -1,6 +1,6 @@
-"""Finds drivers by the entry-point group ``skyloop.drivers``: the entry point's name is the URI scheme.
+"""Find drivers in the entry-point group ``skyloop.drivers``, where an entry point's name is a URI scheme.
 
-A driver's module is imported only when a vehicle of its scheme is requested.
+A driver's module is imported only when a vehicle with its scheme is requested.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import DriverError, SkyloopError, UnknownNameError
 
 GROUP: Final = "skyloop.drivers"
-#: Cached by scheme and package folders: reading all packages' claims takes 20 ms, and a host has thousands of drones.
+#: Cache by scheme and package folders: entry points take 20 ms to read, and a host may have thousands of drones.
 _loaded: Final[dict[tuple[str, tuple[str, ...]], type[Driver]]] = {}
 
 
 def known_schemes() -> list[str]:
-    """Return the schemes that installed packages claim, sorted. Imports no driver."""
+    """Return the schemes claimed by installed packages, sorted, without importing any driver."""
     return sorted(_claims())
 
 
@@ -28,11 +28,11 @@ def driver_class(scheme: str) -> type[Driver]:
     """Import and return the driver class for a scheme.
 
     Args:
-        scheme: Such as ``ardrone``.
+        scheme: The scheme, for example ``ardrone``.
 
     Raises:
         UnknownNameError: No installed package claims the scheme.
-        DriverError: Two packages claim the scheme, or the class can't be loaded; the text names the packages.
+        DriverError: Two packages claim the scheme, or the class can't be loaded; the message names the packages.
         MissingExtraError: A package that the driver needs is not installed.
     """
     known = scheme, tuple(sys.path)
@@ -68,7 +68,7 @@ def make_driver(uri: str | VehicleUri) -> Driver:
 def _claims() -> dict[str, list[EntryPoint]]:
     claims: dict[str, dict[tuple[str, str], EntryPoint]] = defaultdict(dict)
     for entry in entry_points(group=GROUP):
-        # One package may be found in two folders of sys.path; that is not a second claim.
+        # A package found in two folders of sys.path counts as one claim.
         claims[entry.name][entry.value, _package(entry)] = entry
     return {scheme: list(found.values()) for scheme, found in claims.items()}
 
@@ -76,7 +76,7 @@ def _claims() -> dict[str, list[EntryPoint]]:
 def _load(entry: EntryPoint) -> type[Driver]:
     try:
         loaded = entry.load()
-    except SkyloopError:  # its text names the missing package and how to install it
+    except SkyloopError:  # its message names the missing package and how to install it
         raise
     except Exception as error:
         raise DriverError(f"the driver for {entry.name}:// from {_owner(entry)} cannot be loaded: {error!r}") from error

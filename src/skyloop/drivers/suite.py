@@ -1,4 +1,4 @@
-"""The contract of :mod:`skyloop.drivers.base` as tests: subclass it, name the vehicle, and run it with pytest.
+"""The contract of :mod:`skyloop.drivers.base` as tests: subclass them, name the vehicle, and run pytest.
 
 ::
 
@@ -7,11 +7,11 @@
     class TestMyDriver(DriverSuite):
         uri = "mydrone://127.0.0.1?port=5556"
 
-The vehicle at that address must answer and, if it can fly, stand on the ground with room around it: the suite takes
-off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle that is not tied down or
+The vehicle at that address must answer and, if it can fly, be on the ground with room around it: the suite takes
+off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle unless it is tied down or
 in a net.** A vehicle that can't fly is not commanded.
 
-Tests of missing abilities are skipped. The module does not import pytest.
+Tests of abilities that the vehicle lacks are skipped. The module does not import pytest.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 class DriverSuite:
     """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
 
-    Override the class attributes below for a slower vehicle or one that moves less, and :meth:`vehicle_disappears` and
-    :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a fixture
-    and override :meth:`new_driver`.
+    For a vehicle that is slower or moves less, override the class attributes below; override :meth:`vehicle_disappears`
+    and :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a
+    fixture and override :meth:`new_driver`.
 
     Attributes:
-        uri: The address of the vehicle to test with.
-        connect_timeout_s: How long the link may take to come up [s]. All names ending in ``_timeout_s`` are such times.
+        uri: Address of the vehicle to test with.
+        connect_timeout_s: How long the link may take to come up [s]. Other names in ``_timeout_s`` are limits, too.
         close_grace_s: How long joined threads may take to vanish from the system's tables [s].
         speed: Commanded speed forward, backward, left and right [m/s].
         climb: Commanded speed up and down [m/s].
@@ -76,17 +76,17 @@ class DriverSuite:
         yaw_rate: Commanded yaw rate [rad/s].
         distance: How far the vehicle must move in each direction within ``motion_timeout_s`` [m].
         turn: How far the vehicle must turn [rad].
-        near: How close it must get to a commanded position [m].
+        near: How close the vehicle must get to a commanded position [m].
         stand_s: How long the suite watches a vehicle that must not start its motors [s].
-        feedback_age_s: Greatest age of a sample when it arrives [s].
-        frame_age_s: Greatest age of a frame when it arrives [s].
+        feedback_age_s: Maximum age of a sample on arrival [s].
+        frame_age_s: Maximum age of a frame on arrival [s].
         untouched_parameters: Names of parameters that the suite must not write.
     """
 
-    #: The address of the vehicle to test with.
+    #: Address of the vehicle to test with.
     uri: ClassVar[str] = ""
 
-    #: How long things may take [s].
+    #: Time limits [s].
     connect_timeout_s: ClassVar[float] = 5.0
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
@@ -95,10 +95,10 @@ class DriverSuite:
     motion_timeout_s: ClassVar[float] = 6.0
     emergency_timeout_s: ClassVar[float] = 3.0
     lost_timeout_s: ClassVar[float] = 5.0
-    close_grace_s: ClassVar[float] = 2.0  #: for joined threads to vanish from the system's tables
+    close_grace_s: ClassVar[float] = 2.0  #: time for joined threads to vanish from the system's tables
 
-    #: Commands of the flight test: speed and climb [m/s], tilt [rad], yaw rate [rad/s]; how far the vehicle must move
-    #: (distance [m]) and turn [rad]; and how close [m] it must get to a commanded position.
+    #: Commands in the flight test: speed and climb [m/s], tilt [rad], yaw rate [rad/s]. How far the vehicle must move
+    #: (distance [m]) and turn [rad], and how close it must get to a commanded position (near [m]).
     speed: ClassVar[float] = 0.4
     climb: ClassVar[float] = 0.4
     tilt: ClassVar[float] = 0.08
@@ -120,7 +120,7 @@ class DriverSuite:
     # To be implemented or overridden by a driver's test ------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
-        """Return a new, unopened driver. The default finds its class by the entry point of the URI's scheme.
+        """Return a new, unopened driver. By default, its class is found by the entry point for the URI's scheme.
 
         Args:
             uri: The address of the vehicle to test with, perhaps with an option that must be refused.
@@ -178,7 +178,7 @@ class DriverSuite:
 
     def test_constructor_does_no_io(self) -> None:
         """A constructor starts no thread and opens no descriptor, and close() without open() does nothing."""
-        self.new_driver()  # fill import caches first: they are not the driver's resources
+        self.new_driver()  # fill import caches first, because they are not the driver's resources
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
         assert _resources() == before, "a constructor started a thread or opened a descriptor"
@@ -186,7 +186,7 @@ class DriverSuite:
             driver.close()  # close() without open() does nothing
 
     def test_capabilities_before_open(self) -> None:
-        """Capabilities are known before open() and make sense."""
+        """Capabilities are known before open(), and make sense."""
         capabilities = self.new_driver().capabilities()
         assert capabilities.vehicle, "capabilities need the vehicle's family name"
         unknown = capabilities.actions - set(ACTION_NAMES.values())
@@ -247,7 +247,7 @@ class DriverSuite:
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
-        with self.opened() as (_, sink):  # resources that libraries keep for themselves exist from here on
+        with self.opened() as (_, sink):  # from here on, resources that libraries keep for themselves exist
             self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
@@ -279,7 +279,7 @@ class DriverSuite:
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
-        """Frames arrive, are recent, and have the announced cameras' names and sizes."""
+        """Frames arrive, are recent, and have the names and sizes of the announced cameras."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
@@ -299,7 +299,7 @@ class DriverSuite:
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
-        """Encoded pictures arrive and have the announced cameras' names and sizes."""
+        """Encoded pictures arrive, and have the names and sizes of the announced cameras."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
@@ -333,7 +333,7 @@ class DriverSuite:
     def test_apply_returns_what_was_applied_at_once(self) -> None:
         """``apply`` returns a finite action within :data:`APPLY_S`.
 
-        Runs on the ground, with actions that do not take off; the flight has its own test.
+        Runs on the ground, with actions that do not take off; flying has its own test.
         """
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
@@ -351,12 +351,12 @@ class DriverSuite:
                     times_s.append(time.perf_counter() - begun)
                     assert type(applied).__name__ in {type(known).__name__ for known in (*harmless, Takeoff())}
                     assert applied.finite, f"apply({action.name}) returned {applied}"
-                # The median, because on a busy machine any single call may be delayed.
+                # Use the median, because on a busy machine any single call may be delayed.
                 middle_s = statistics.median(times_s)
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
-        """A repeated action does the same as a new one while no one else commands the vehicle. On the ground."""
+        """On the ground, a repeated action does the same as a new one while nothing else commands the vehicle."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
@@ -395,11 +395,11 @@ class DriverSuite:
                     assert not problem, f"{parameter.name}: its {what} {value!r} {problem}"
 
     def test_parameters_round_trip(self) -> None:
-        """A written value is in force and listed. Restores the old value."""
+        """A written value is in force and listed; the old value is restored afterwards."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             end = time.monotonic() + self.feedback_timeout_s
-            while not (writable := self._writable(driver)):  # a driver may have to request them first
+            while not (writable := self._writable(driver)):  # a driver may need to request them first
                 if time.monotonic() > end:
                     raise unittest.SkipTest(f"parameters() lists no writable one within {self.feedback_timeout_s} s")
                 time.sleep(0.05)
@@ -472,7 +472,7 @@ class DriverSuite:
             try:
                 lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
                 assert lost, f"the link was not reported LOST; reported: {sink.links}"
-                with suppress(DriverError):  # the best answer
+                with suppress(DriverError):  # the best response
                     driver.apply(Takeoff())
             finally:
                 self.vehicle_appears()
@@ -490,7 +490,7 @@ class DriverSuite:
         assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
-        """An emergency stop is reported and ends only with a reset. On the ground."""
+        """On the ground, an emergency stop is reported, and ends only with a reset."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
@@ -520,7 +520,7 @@ class DriverSuite:
 
 
 def _resources() -> tuple[int, int]:
-    """Return the numbers of threads and open descriptors of this process (0 descriptors without /proc)."""
+    """Return how many threads and open descriptors this process has (0 descriptors if there is no /proc)."""
     descriptors = Path("/proc/self/fd") if sys.platform == "linux" else Path("/dev/fd")
     count = len(list(descriptors.iterdir())) if descriptors.exists() else 0
     return threading.active_count(), count

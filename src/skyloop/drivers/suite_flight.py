@@ -1,4 +1,4 @@
-"""The driver suite's flight: take-off, both directions of each axis, landing, judged by the vehicle's feedback."""
+"""The flight in the driver suite: take-off, both directions along each axis, and landing, checked by feedback."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from skyloop.messages.geometry import wrap_angle
 if TYPE_CHECKING:
     from skyloop.drivers.suite import DriverSuite
 
-NEAR_RAD = 0.3  #: tolerance of the commanded heading
-#: How far the vehicle moved between two samples, with sign; None if it does not report that.
+NEAR_RAD = 0.3  #: tolerance for the commanded heading [rad]
+#: Returns how far the vehicle moved between two samples, with its sign; None if the vehicle does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
 
 
 class Flight:
-    """One flight of the suite, with native take-off and landing if the vehicle has them, otherwise with set-points.
+    """One flight in the suite, with the vehicle's own take-off and landing if it has them, otherwise by set-points.
 
     Args:
         suite: Provides speeds, distances and time-outs.
@@ -49,7 +49,7 @@ class Flight:
 
         Args:
             condition: Called with the newest feedback after each of the driver's calls.
-            timeout_s: [s]
+            timeout_s: How long to wait [s].
             what: Completes "not ... within" in the error.
 
         Returns:
@@ -68,10 +68,10 @@ class Flight:
         return sink.newest
 
     def wake(self) -> None:
-        """Wait until the vehicle is awake, if its link reports that it is waking up.
+        """Wait until the vehicle has started up, if its link reports that it is starting.
 
         Raises:
-            AssertionError: The vehicle was not awake within the suite's ``takeoff_timeout_s``.
+            AssertionError: The vehicle had not started up within the suite's ``takeoff_timeout_s``.
         """
         links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
         assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
@@ -80,7 +80,7 @@ class Flight:
         """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
 
         Raises:
-            AssertionError: The vehicle was not awake, or not in the air within the suite's ``takeoff_timeout_s``.
+            AssertionError: The vehicle had not started up, or not taken off, within the suite's ``takeoff_timeout_s``.
         """
         if "takeoff" in self.actions:
             self.wake()
@@ -94,7 +94,7 @@ class Flight:
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait for the landing; without a native one, descend until the vehicle is landed or below 0.1 m.
+        """Land and wait; a vehicle without its own landing descends until it is landed or below 0.1 m.
 
         Raises:
             AssertionError: The vehicle had not landed within the suite's ``land_timeout_s``.
@@ -114,13 +114,13 @@ class Flight:
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
         """Apply a velocity if the vehicle supports it, otherwise the attitude that accelerates that way.
 
-        Sent once: the driver must keep it in force.
+        It is sent only once, because the driver must keep it in force.
 
         Args:
-            forward: [m/s], body axes; for an attitude only the sign counts, and the suite's ``tilt`` is the angle.
-            left: As ``forward``.
-            up: [m/s]
-            turn: [rad/s], positive counter-clockwise seen from above.
+            forward: In body axes [m/s]; for an attitude only the sign counts, and the angle is the suite's ``tilt``.
+            left: Like ``forward``.
+            up: Vertical velocity [m/s].
+            turn: Yaw rate [rad/s], positive counter-clockwise seen from above.
         """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
@@ -130,7 +130,7 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move in both directions along each axis: only then is the sign known to be right.
+        """Move in both directions along each axis, which is needed to check the sign.
 
         Raises:
             AssertionError: The vehicle did not move the suite's ``distance`` or ``turn`` within ``motion_timeout_s``.
@@ -143,10 +143,10 @@ class Flight:
             self._goes("left", _aside, sign * suite.distance, left=sign * suite.speed)
 
     def goes_to_places(self) -> None:
-        """Fly to a position aside and above, turn, and fly back, if the vehicle supports positions.
+        """If the vehicle supports positions, fly to one to the side and above, turn, and fly back.
 
         Raises:
-            AssertionError: It had not arrived, or not turned, within the suite's ``motion_timeout_s``.
+            AssertionError: The vehicle had not arrived, or not turned, within the suite's ``motion_timeout_s``.
         """
         suite, start = self.suite, self.sink.newest
         assert start is not None
@@ -160,7 +160,7 @@ class Flight:
             def is_there(feedback: Feedback, place: Position = place) -> bool:
                 near = feedback.position_m is not None and math.dist(feedback.position_m, place.place) <= suite.near
                 turned = feedback.yaw_rad is None or abs(wrap_angle(turn - feedback.yaw_rad)) <= NEAR_RAD
-                return near and turned  # without a yaw, it keeps its heading
+                return near and turned  # if no yaw is given, the vehicle keeps its heading
 
             self.until(is_there, suite.motion_timeout_s, f"at {place}")
 
@@ -169,7 +169,7 @@ class Flight:
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not report the measure of this axis
+            return  # the vehicle does not report what is measured for this axis
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -181,7 +181,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Wait until the vehicle is slow again, if it reports its speed. One with only attitudes coasts."""
+        """Wait until the vehicle is slow again, if it reports its speed, because after an attitude it coasts."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -219,7 +219,7 @@ def _aside(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """Return the distance along the heading (axis 0) or to its left (1) [m]; without a position, the speed."""
+    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed if the position is unknown."""
     if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
     east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]

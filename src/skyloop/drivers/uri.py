@@ -13,15 +13,15 @@ from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, withou
 from skyloop.errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_SHORT_SECRET: Final = 4  # characters: shorter secrets occur within ordinary words
+_SHORT_SECRET: Final = 4  # number of characters below which secrets also occur within ordinary words
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
 class VehicleUri:
     """A parsed vehicle address that never shows its secrets.
 
-    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles contain no users, passwords or keys (see
-    ``skyloop.address``). Only code that opens the vehicle reads those, with :meth:`reveal_place` and :meth:`reveal`.
+    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles don't contain users, passwords or keys (see
+    ``skyloop.address``). Only code that opens the vehicle reads them, with :meth:`reveal_place` and :meth:`reveal`.
 
     Attributes:
         scheme: The driver's name.
@@ -38,7 +38,7 @@ class VehicleUri:
             scheme: The driver's name.
             place: A host, a path, or nothing.
             options: Options by name.
-            text: The address as given; empty if built in code.
+            text: The address as given; empty if it is built in code.
         """
         given = dict(options or {})
         broken = is_broken(given)
@@ -95,7 +95,7 @@ class VehicleUri:
     def scrub(self, text: str) -> str:
         """Return a text, for example a library's error, with the secrets of this address hidden."""
         for given, shown in self._secrets:
-            if len(given) < _SHORT_SECRET:  # inside words it would hide, and so reveal, too much
+            if len(given) < _SHORT_SECRET:  # hiding it inside words would hide, and thereby reveal, too much
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
             else:
                 text = text.replace(given, shown)
@@ -145,14 +145,14 @@ class VehicleUri:
         return int(value)
 
     def flag(self, option: str, default: bool = False) -> bool:
-        """Return an option as a bool: ``1``, ``true``, ``yes`` or nothing after the name; ``0``, ``false``, ``no``.
+        """Return an option as a bool: ``1``, ``true``, ``yes`` or the bare name; ``0``, ``false`` or ``no``.
 
         Args:
             option: Name of the option.
             default: Returned if the option is not given.
 
         Raises:
-            UsageError: The option is another word.
+            UsageError: The option has any other value.
         """
         given = self.options.get(option)
         if given is None:

@@ -1,4 +1,4 @@
-"""The vehicle link over sockets: its thread, and the renewal of sockets while nothing is received.
+"""The vehicle link over sockets: runs its thread, and renews sockets while nothing is received.
 
 The session decides what the link carries: see :mod:`skyloop.drivers.vehicle_session`.
 """
@@ -21,11 +21,11 @@ from skyloop.drivers.base import ServedLink, Sink
 from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
 
-NAME_WAIT_S: Final = 0.2  #: enough for most name look-ups
-PAUSE_S: Final = 0.03  #: after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets without data, because this host's address may have changed
+NAME_WAIT_S: Final = 0.2  #: time that suffices for most name look-ups
+PAUSE_S: Final = 0.03  #: pause after an error
+RENEW_NS: Final = nanoseconds(2.0)  #: how often silent sockets are renewed, as this host's address may have changed
 MAX_DATAGRAM: Final = 65_536
-BURST: Final = 32  #: datagrams read before commands get their turn
+BURST: Final = 32  #: maximum number of datagrams read before commands get their turn
 
 S = TypeVar("S", bound=VehicleSession)
 C = TypeVar("C", bound="Readable")
@@ -40,13 +40,13 @@ class Readable(Protocol):
 
 
 class NameLookup:
-    """Looks up a host's name in its own thread: without a network, a resolver often takes 10 s.
+    """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
 
-    One host at a time. Not thread-safe.
+    It handles one host at a time. Not thread-safe.
 
     Args:
-        family: Family of the result.
-        wait_s: How long :meth:`address` may block [s]; 0 on a thread that serves others, too.
+        family: Address family of the result.
+        wait_s: How long :meth:`address` may block [s]; 0 on a thread that also serves others.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
@@ -56,11 +56,11 @@ class NameLookup:
 
     @property
     def answered(self) -> bool:
-        """Whether a pending look-up has finished, so that asking again is worthwhile."""
+        """Whether a pending look-up has finished, so that it is worth calling :meth:`address` again."""
         return self._asking is not None and self._asking.answered.is_set()
 
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for ``wait_s`` at most."""
+        """Return a host's first address. Blocks for at most ``wait_s``."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -96,7 +96,7 @@ class _PendingLookup:
 class VehicleLink(ABC, Generic[S]):
     """Serves a session in its own thread from :meth:`start` to :meth:`stop`.
 
-    The session makes all decisions, with ``lock`` held; its callbacks run with the lock free. A subclass for a kind of
+    The session makes all decisions while ``lock`` is held; its callbacks run while it is free. A subclass for a kind of
     vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each socket that
     it opens to :meth:`_watch`.
 
@@ -104,10 +104,10 @@ class VehicleLink(ABC, Generic[S]):
         name: Name of the thread.
         session: The vehicle's protocol.
         deliver: Called on the link's thread with the session's callbacks for the sink.
-        clock: Monotonic, ns.
-        family: Address family of the host's look-up.
+        clock: A monotonic clock [ns].
+        family: Address family for looking up the host.
         close_s: How long :meth:`stop` waits for the thread.
-        serve: Hands the link to a thread that serves several; None: the link has its own.
+        serve: Hands the link to a thread that serves several links; None: the link has its own thread.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class VehicleLink(ABC, Generic[S]):
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
         self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
-        self._awake_ns = 0  # latest time at which its thread wakes
-        self._opened_ns: int | None = None  # when sockets were last opened, or an attempt was made
+        self._awake_ns = 0  # time at which its thread wakes at the latest
+        self._opened_ns: int | None = None  # when sockets were last opened, or an attempt to do so was made
         self._close_s = close_s
-        self._within: int | None = None  # the thread that serves it at the moment
+        self._within: int | None = None  # identity of the thread that is serving it
         self._ended = threading.Event()
         self._serve_elsewhere = serve
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -148,7 +148,7 @@ class VehicleLink(ABC, Generic[S]):
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread, close the sockets and end the session; callers that wait for an answer get none."""
+        """Stop the thread, close the sockets and end the session; callers waiting for an answer get none."""
         self._stopping.set()
         self._wake()
         if self._within != threading.get_ident():
@@ -157,7 +157,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Pass an action to the session, and send it at once if its pace allows; return the result. Thread-safe."""
+        """Pass an action to the session, and send it at once if the pace allows; return the result. Thread-safe."""
         return self._decide(partial(self.session.command, action))
 
     # For methods of subclasses that the proxy's threads call ------------------------------------------------------
@@ -176,7 +176,7 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Ask the vehicle and return its answer, or ``otherwise`` if none arrives in time. Not on the link's thread.
+        """Send a request; return the vehicle's answer, or ``otherwise`` if it is late. Not on the link's thread.
 
         ``ask`` is called with the lock held; its argument is the function that receives the answer.
         """
@@ -212,17 +212,17 @@ class VehicleLink(ABC, Generic[S]):
         """Send everything due. With the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return how long after their last opening the sockets are opened again; None: not in the present state.
+        """Return the time after which sockets are reopened, counted from their opening; None: not in the present state.
 
-        The default suits UDP: while nothing is received. Called with the lock held.
+        The default suits UDP: sockets are reopened while nothing is received. Called with the lock held.
         """
         return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
-        """Do work at a pace other than the session's. With the lock held, on the link's thread."""
+        """Do work that has a pace of its own. With the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
-        """Call a function on the link's thread, with the lock free, whenever a source is readable."""
+        """Call a function whenever a source is readable, on the link's thread, with the lock free."""
         self._selector.register(source, selectors.EVENT_READ, ready)
 
     def _forget(self, source: Readable) -> None:
@@ -253,7 +253,7 @@ class VehicleLink(ABC, Generic[S]):
         try:
             port.send(datagram)
         except BlockingIOError:
-            pass  # lost, as any datagram may be
+            pass  # it is lost, as any datagram may be
         except OSError as error:
             self.session.failed(error)
 
@@ -333,7 +333,7 @@ class VehicleLink(ABC, Generic[S]):
 
     def _wake(self) -> None:
         """Wake the link's thread. Thread-safe."""
-        with suppress(OSError):  # it is awake, or it has ended
+        with suppress(OSError):  # the thread is awake already, or it has ended
             self._waker.send(b"\0")
 
     def _drain_wakeups(self) -> None:
@@ -348,11 +348,11 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
     A subclass for a kind of vehicle implements :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
     """
 
-    RETRY_NS: ClassVar[int]  #: between connection attempts
+    RETRY_NS: ClassVar[int]  #: pause between connection attempts
 
-    _silent_ns: int | None = None  # silence after which the connection is reopened; None: never for silence
+    _silent_ns: int | None = None  # duration of silence after which the connection is reopened; None: never
     _connection: C | None = None
-    _broken = False  # nothing more can be sent
+    _broken = False  # whether nothing more can be sent
 
     @abstractmethod
     def _connect(self) -> C:

@@ -1,4 +1,4 @@
-"""Shared parts of the vehicles' sessions: the state of the vehicle link, its reasons, and pending events.
+"""What the sessions of all vehicles share: the state of the vehicle link, the reasons for it, and pending events.
 
 Pure, except for :func:`serial_trouble`, which inspects the port's device.
 """
@@ -21,9 +21,9 @@ from skyloop.drivers.base import Sink
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
-_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # of a port locked by another program
-_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # below /dev
-_MAX_LISTED_PORTS: Final = 4  # that are listed
+_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors for a port locked by another program
+_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of ports below /dev
+_MAX_LISTED_PORTS: Final = 4  # maximum number of ports listed in a message
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
@@ -36,16 +36,16 @@ def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
-    """How long a vehicle may be silent [ns] before the link is degraded or lost."""
+    """How long a vehicle may be silent [ns] before its link counts as degraded or lost."""
 
     degraded_ns: int
     lost_ns: int
-    first_word_ns: int  #: since opening; a vehicle without any data by then is reported as lost
+    first_word_ns: int  #: time since opening after which a vehicle that has sent no data is reported as lost
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleEvent:
-    """An event that a session has for the sink, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
+    """A session's event for the sink, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
 
     kind: EventKind
     text: str
@@ -54,41 +54,41 @@ class VehicleEvent:
 
 
 def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> VehicleEvent:
-    """Return a message of the vehicle itself."""
+    """Return an event with a message from the vehicle itself."""
     return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
 class Arrival(Enum):
-    """A packet's place in the order, judged by its own number."""
+    """A packet's place in the order, according to its number."""
 
     NEW = auto()
-    LATE = auto()  #: others overtook it
-    RESTARTED = auto()  #: the vehicle counts from the start again: it has restarted
+    LATE = auto()  #: later packets overtook it
+    RESTARTED = auto()  #: the vehicle has restarted, and counts from the start again
 
 
-RESTART_RUN: Final = 5  #: this many packets behind, in order among themselves, show a new count
-RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between them: they must not be one burst
+RESTART_RUN: Final = 5  #: number of packets with low numbers, in order among themselves, that prove a restart
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and the last, which must not be one burst
 
 
 class RestartWatch:
-    """Distinguishes a restarted vehicle from late packets, by a growing number in the packets. Pure.
+    """Distinguishes a restart of the vehicle from late packets, by the packets' increasing numbers. Pure.
 
     Args:
-        tolerance: Packets behind by no more than this are accepted.
-        wrap: The number restarts at 0 there; 0: never.
+        tolerance: Packets whose numbers lag by no more than this are accepted.
+        wrap: Where numbers wrap around to 0; 0: never.
     """
 
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
         self._tolerance, self._wrap = tolerance, wrap
         self._newest: int | None = None
-        self._behind: tuple[int, int, int] | None = None  # the last one behind, how many, arrival of the first
+        self._behind: tuple[int, int, int] | None = None  # the last number behind, how many were, arrival of the first
 
     def forget(self) -> None:
-        """Accept the next packet as new: the vehicle was silent."""
+        """Accept the next packet as new, because the vehicle was silent."""
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
-        """Classify a packet that has just arrived by its number."""
+        """Classify a packet, which has just arrived, by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
@@ -109,87 +109,87 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: While nothing is received, a request is kept, or sent, for this long after its last repeat. Anyone who still wants it
-#: repeats it, and later it might interfere with someone else's flight.
+#: While nothing is received, a request is kept, or sent, for this long after its last repeat. An application that still
+#: wants it keeps repeating it; otherwise it might interfere with another application's flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
 class VehicleSession(ABC):
-    """The protocol of one opened driver with its vehicle. Not thread-safe.
+    """The protocol between one opened driver and its vehicle. Not thread-safe.
 
-    Time is an argument; bytes go in and out. Calls of the proxy's sink are collected as callbacks, which the caller
-    runs when it holds no lock. A subclass for a kind of vehicle sets ``_received_ns`` with each valid packet, and calls
-    :meth:`_check_silence` with each poll.
+    Time is an argument; bytes go in and out. Calls to the proxy's sink are collected as callbacks, which the caller
+    runs while it holds no lock. A subclass for a kind of vehicle sets ``_received_ns`` at each valid packet, and calls
+    :meth:`_check_silence` at each poll.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
 
     def __init__(self, now_ns: int) -> None:
-        self.due_ns = now_ns  #: when there is next something to send
-        self.link_state: LinkState | None = None  #: as last reported
+        self.due_ns = now_ns  #: when there will next be something to send
+        self.link_state: LinkState | None = None  #: the state last reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # None: not since opening or loss
+        self._received_ns: int | None = None  # when the vehicle was last received; None: not since opening or loss
         self._unreachable = ""
-        self._remedy = ""  # remedy for unreachability
+        self._remedy = ""  # what to do if the vehicle is unreachable
         self._reported_reason = ""
         self._reported_ns = now_ns
-        self._landing_ns: int | None = None  # when a landing was last requested, or the vehicle last received since
+        self._landing_ns: int | None = None  # when a landing was last requested or, if later, the vehicle last received
 
     @property
     def is_receiving(self) -> bool:
-        """Whether the vehicle's data arrive, or did until just now."""
+        """Whether data from the vehicle are arriving, or were until just now."""
         return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and return what is applied, within the limits. Raises DriverError if it can't."""
+        """Accept an action; return what is applied, within the limits. Raises DriverError if that is impossible."""
 
     @abstractmethod
     def close(self) -> None:
-        """End the session; callers that wait for an answer get a failure."""
+        """End the session; callers waiting for an answer get a failure."""
 
     def unreachable(self, reason: str) -> None:
-        """Note why the vehicle can't be reached: nothing listens, there is no route, or the connection failed."""
+        """Record why the vehicle can't be reached: nothing listens, there is no route, or the connection failed."""
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
-        """Note an error of a socket or port, with a remedy for people."""
+        """Record an error of a socket or port, with a remedy for people."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
     def connected(self) -> None:  # noqa: B027  most connections need nothing
-        """Handle a new connection: no data of an older one follow."""
+        """Handle a new connection, after which no data from an older one arrive."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """Handle an open connection that accepts no more data: the vehicle is lost, whatever it still sends."""
+        """Handle an open connection that accepts no more data: the vehicle is lost even if it still sends."""
         self.failed(error)
         self.due_ns = now_ns
         if self._received_ns is not None:
             self._lose(f"the connection failed: {self._unreachable}", now_ns)
 
     def drain(self) -> list[SinkCallback]:
-        """Return the sink's callbacks since the last call, in order."""
+        """Return the callbacks for the sink since the last call, in order."""
         for event in self._new_events():
             self._publish_event(event)
         pending, self._pending = self._pending, []
         return pending
 
     def _new_events(self) -> Iterable[VehicleEvent]:
-        """Return the events of this kind of vehicle since the last call."""
+        """Return the events since the last call that are specific to this kind of vehicle."""
         return ()
 
     @abstractmethod
     def _describe_silence(self, since: str, why: str) -> str:
-        """Return the text for people to see while nothing is received.
+        """Return the text to show while nothing is received.
 
         Args:
-            since: The duration; empty or a phrase that starts with a blank.
-            why: The host's reason; empty or a phrase that starts with a blank.
+            since: The duration, as a phrase that starts with a space; may be empty.
+            why: The host's reason, as a phrase that starts with a space; may be empty.
         """
 
     def _advice(self) -> str:
-        """Return an instruction for people for when nothing is received and nothing has failed."""
+        """Return an instruction for people, for use while nothing is received although nothing has failed."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -197,10 +197,10 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """Drop all state of the lost vehicle: everything starts over with its next packet."""
+        """Drop all state of the lost vehicle, so that everything starts over with its next packet."""
 
     def _keep(self, action: AnyAction, now_ns: int) -> None:
-        """Note an accepted action: a landing is kept while nothing is received, but not for ever."""
+        """Record an accepted action: a landing is kept while nothing is received, but not forever."""
         if not isinstance(action, Idle):
             self._landing_ns = now_ns if isinstance(action, Land) else None
 
@@ -240,7 +240,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` must be called next, at most ``latest_ns``."""
+        """Return when :meth:`_check_silence` must be called next; ``latest_ns`` at the latest."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -269,7 +269,7 @@ class VehicleSession(ABC):
 class LinkTrouble:
     """Why a vehicle can't be reached."""
 
-    reason: str  #: the failure; may be empty
+    reason: str  #: what failed; may be empty
     remedy: str = ""  #: an instruction for people; may be empty
 
 
@@ -289,9 +289,9 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
 
     Args:
         error: The error from opening or reading.
-        port: Its path.
-        advice: What to do if there is no better advice.
-        devices: Where to look for other ports, to list them.
+        port: Path of the port.
+        advice: Advice to give if there is nothing better.
+        devices: Folder to search for other ports, which are listed.
     """
     path = Path(port)
     try:

@@ -24,7 +24,7 @@ SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
 HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
-MAX_BODY: Final = 60_000  #: bytes, so that a packet fits into one datagram; pixels are sent separately
+MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
 
 Sample = (
     Command
@@ -96,7 +96,7 @@ _BY_PREFIX: Final = {
 
 
 def encode(sample: Sample) -> bytes:
-    """Encode a sample to a packet.
+    """Encode a sample as a packet.
 
     Raises:
         ValueError: The body is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
@@ -111,7 +111,7 @@ def decode(packet: bytes | memoryview) -> Sample:
     """Decode a packet, in bounded time and memory.
 
     Args:
-        packet: Any bytes, from any source.
+        packet: The bytes, which may come from any source.
 
     Returns:
         The sample, with its types, lengths and ranges checked.
@@ -133,7 +133,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 
 
 def packet_kind(packet: bytes | memoryview) -> int:
-    """Return the kind of a packet, after checking its header against its length.
+    """Return a packet's kind, after checking that its header matches its length.
 
     Raises:
         DecodeError: The header is of another version, or does not match the packet.

@@ -16,8 +16,8 @@ import msgspec
 from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
-MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is treated as a mistake
-MAX_YAW_RAD: Final = 1000.0  #: and so is a larger yaw
+MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is rejected as a mistake [m]
+MAX_YAW_RAD: Final = 1000.0  #: so is a larger yaw [rad]
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -35,7 +35,7 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def problem(self) -> str:
-        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
         return ""
 
 
@@ -66,8 +66,8 @@ class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
 class Attitude(Action, frozen=True, array_like=True, tag=6):
     """Attitude, climb rate and yaw rate.
 
-    ``roll`` [rad] right side down is positive, ``pitch`` [rad] nose down is positive (REP 103: about y left),
-    ``climb`` [m/s] up, ``yaw_rate`` [rad/s] counter-clockwise.
+    ``roll`` [rad] is positive with the right side down, ``pitch`` [rad] with the nose down (REP 103: about y, left),
+    ``climb`` [m/s] upwards, ``yaw_rate`` [rad/s] counter-clockwise.
     """
 
     roll: float = 0.0
@@ -98,8 +98,8 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 class Position(Action, frozen=True, array_like=True, tag=8):
     """A position to fly to and hold, in the world axes of ``Feedback.position``.
 
-    ``x`` east, ``y`` north, ``z`` up [m]; ``yaw`` counter-clockwise from x [rad], None keeps the present heading.
-    ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None: as fast as the limits allow.
+    ``x`` is east, ``y`` north, ``z`` up [m]; ``yaw`` is counter-clockwise from x [rad], or None to keep the heading.
+    ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None means as fast as the limits allow.
     """
 
     x: float
@@ -118,7 +118,7 @@ class Position(Action, frozen=True, array_like=True, tag=8):
 
     @property
     def problem(self) -> str:
-        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
         for name in ("x", "y", "z"):
             if abs(value := getattr(self, name)) > MAX_RANGE_M:
                 return f"{name} is {value:g} m and must be within {MAX_RANGE_M:g} m of the vehicle's origin"
@@ -140,7 +140,7 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
     """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or hover there.
 
     ``height`` [m] is the minimum height above the start on the way; ``land`` selects landing at the end rather than
-    hovering. None: as in the proxy's parameters ``return.height`` and ``return.land``.
+    hovering. For None, the proxy's parameters ``return.height`` and ``return.land`` apply.
     """
 
     height: float | None = None
@@ -153,7 +153,7 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
 
     @property
     def problem(self) -> str:
-        """Why the numbers make no sense, as a text for people; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
         if self.height is not None and not 0.0 <= self.height <= MAX_RANGE_M:
             return f"height is {self.height:g} m above the start and must be from 0 to {MAX_RANGE_M:g} m"
         return ""
@@ -163,7 +163,7 @@ AnyAction = (
     Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position | ReturnToStart
 )
 
-#: Actions that set where or how fast to fly. Each replaces the previous one, and a program sends them periodically.
+#: Actions that set where or how fast to fly. Each replaces the previous one, and programs send them periodically.
 SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
 
 ACTION_NAMES: dict[type[Action], str] = {
@@ -183,32 +183,32 @@ ACTION_NAMES: dict[type[Action], str] = {
 class Command(msgspec.Struct, frozen=True, array_like=True):
     """One packet of the command channel.
 
-    A packet whose ``seq`` is not higher than all before is refused, whatever it asks for, unless it stops the motors.
+    A packet whose ``seq`` is not higher than all earlier ones is refused, unless it stops the motors.
     """
 
-    seq: Count  #: grows with every packet of a connection
-    lease: Count  #: number of the lease it is sent under; 0 for none (emergency stop only)
-    intent: Count  #: grows with each request of the *application*; the library's repeats keep it
-    sent_ns: int  #: time of sending on the proxy's clock; unbounded, because an emergency stop counts whatever its time
+    seq: Count  #: increases with every packet of a connection
+    lease: Count  #: number of the lease it is sent under; 0 if there is none (emergency stop only)
+    intent: Count  #: increases with each request by the *application*; the library's repeats keep it
+    sent_ns: int  #: when it was sent, on the proxy's clock; unbounded, because emergency stops are valid at any time
     action: AnyAction
     automatic: bool = (
-        False  #: requested by the library, not by a person or a program: never takes a vehicle from others
+        False  #: requested by the library, not by a person or a program, and so never takes a vehicle from others
     )
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):
-    """Echo on the ``commands`` topic: a received command and what the proxy applied."""
+    """Echo on the ``commands`` topic: a command received by the proxy, and what the proxy applied."""
 
     seq: Count
     lease: Count
-    app_id: Count  #: 0: the proxy itself (failsafe, autopilot)
+    app_id: Count  #: number of the application; 0 for the proxy itself (failsafe, autopilot)
     sent_ns: TimeNs
     applied_ns: TimeNs
     asked: AnyAction
-    applied: AnyAction  #: after limits, and as the driver applied it
+    applied: AnyAction  #: the action after the limits, as the driver applied it
 
 
-MAX_OUTCOME_TEXT: Final = 300  #: characters
+MAX_OUTCOME_TEXT: Final = 300  #: characters in an outcome's text
 
 
 class Fate(StrEnum):
@@ -230,7 +230,7 @@ class Fate(StrEnum):
     JUMPED = "jumped"
 
 
-#: The only list of what ends an intent, as texts for people; ``docs/proxy.md`` is generated from it.
+#: The single list of what can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
 ENDINGS: Final[dict[Fate, str]] = {
     Fate.COMPLETED: "it was carried out",
     Fate.REFUSED: "it was refused",
@@ -249,13 +249,13 @@ ENDINGS: Final[dict[Fate, str]] = {
 
 
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """Fate of the newest intent of the application that commands, or commanded last."""
+    """Fate of the newest intent of the application that is commanding, or was the last to do so."""
 
     app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
-    intent: Count = 0  #: number of the intent, as in its commands
+    intent: Count = 0  #: number of the intent, as in the commands for it
     fate: Fate = Fate.UNDER_WAY
-    reason: Refusal | None = None  #: why it, or a repeat of it, was refused
-    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the same, for people
+    reason: Refusal | None = None  #: why the intent or a repeat of it was refused
+    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the reason in readable form
 
     @property
     def over(self) -> bool:
@@ -269,13 +269,13 @@ class Outcome(msgspec.Struct, frozen=True, array_like=True):
 
 
 class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
-    """A measured pose that the pilot's application sends to the vehicle. World axes x east, y north, z up."""
+    """A measured pose that the pilot's application sends to the vehicle. World axes are x east, y north, z up."""
 
     captured_ns: TimeNs  #: time of the measurement, on the proxy's clock
     position_m: tuple[float, float, float]  #: position of the body's origin [m]
     quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
-    position_std_m: float | None = None  #: standard deviation, if known
-    attitude_std_rad: float | None = None  #: standard deviation, if known
+    position_std_m: float | None = None  #: standard deviation of the position [m], if known
+    attitude_std_rad: float | None = None  #: standard deviation of the attitude [rad], if known
 
 
 def check_pose(

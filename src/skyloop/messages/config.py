@@ -14,7 +14,7 @@ from skyloop.messages.relayed import MAX_CODE, ProcessorName
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
 LONGEST_TERM_S = 86_400.0
 Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
-MAX_REASON = 200  #: characters of a holder's reason for declining
+MAX_REASON = 200  #: characters in a holder's reason for declining
 ClockName = Annotated[str, msgspec.Meta(max_length=64)]
 Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
@@ -24,13 +24,13 @@ LOWEST_PRIORITY = 31
 
 
 class Capabilities(msgspec.Struct, frozen=True, array_like=True):
-    """What a vehicle can do, known before the driver opens it."""
+    """A vehicle's capabilities, known before the driver opens it."""
 
-    vehicle: str  #: the family, e.g. ``sim`` or ``ardrone2``
-    actions: frozenset[str] = frozenset()  #: names of the actions that the vehicle itself supports; empty: can't fly
+    vehicle: str  #: the vehicle's family, e.g. ``sim`` or ``ardrone2``
+    actions: frozenset[str] = frozenset()  #: names of actions that the vehicle itself supports; empty if it can't fly
     cameras: tuple[CameraInfo, ...] = ()
     description: str = ""
-    why_not: str = ""  #: why the vehicle can't fly, as a text for people
+    why_not: str = ""  #: human-readable reason why the vehicle can't fly
     software: frozenset[str] = frozenset()  #: names of the actions that the proxy's software autopilot adds
 
 
@@ -40,7 +40,7 @@ class Capabilities(msgspec.Struct, frozen=True, array_like=True):
 class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
     """First request of a connection."""
 
-    name: Name  #: the application's name, for people
+    name: Name  #: the application's name, for display
     role: Role = Role.PILOT
 
 
@@ -48,8 +48,8 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: wait in the queue while another application holds it; False: be refused at once
-    for_s: Term | None = None  #: how long it is needed, from the grant on [s]; nil: until it is given back
+    queue: bool = True  #: whether to wait in the queue if another application holds it; False: be refused at once
+    for_s: Term | None = None  #: how long it is needed after the grant [s]; nil: until it is given back
     takeover: Takeover = Takeover.NOW
 
 
@@ -68,7 +68,7 @@ class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
     name: ParameterName
     value: Value
-    lease: Count  #: writing needs the authority
+    lease: Count  #: the sender's lease, because writing needs the authority
 
 
 class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
@@ -80,7 +80,7 @@ class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
 class Ping(msgspec.Struct, frozen=True, array_like=True, tag=7):
     """Ask for the proxy's time, to estimate the clock offset and to check that the proxy is alive."""
 
-    sent_ns: TimeNs  #: on the requester's clock
+    sent_ns: TimeNs  #: time of sending, on the requester's clock
 
 
 class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
@@ -88,25 +88,25 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
 
 
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
-    """Join the workers of a processor, or stay one: workers repeat it some times a second for as long as they run.
+    """Join the workers of a processor, or remain one: workers repeat this several times a second while they run.
 
     The answer is :class:`Done`; the worker's share of the frames arrives as a :class:`ProcessorShare`.
     """
 
     processor: ProcessorName
-    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: the same for all workers of a processor
+    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: identifies the code that all workers of a processor run
     camera: Name
-    shared: bool = True  #: each frame goes to one worker; False: every worker gets all frames
-    ready: bool = True  #: False: this worker can't take frames at present, so the others get them
+    shared: bool = True  #: True: each frame goes to one worker; False: every worker gets all frames
+    ready: bool = True  #: False: this worker can't take frames at present, so they go to the others
 
 
 class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
     """The holder's answer to an application that requests the authority."""
 
     lease: Count  #: the holder's own lease
-    app_id: Count  #: the application that asked
+    app_id: Count  #: number of the application that asked
     grant: bool  #: hand the authority over now; False: not yet
-    reason: Reason = ""  #: reason for declining, for people
+    reason: Reason = ""  #: human-readable reason for declining
 
 
 AnyRequest = (
@@ -141,20 +141,20 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
     run_id: Count  #: random; a different number means that the proxy has restarted
     pid: Count
     uri: str  #: the vehicle's address
-    now_ns: TimeNs  #: the proxy's clock
+    now_ns: TimeNs  #: current time on the proxy's clock
     capabilities: Capabilities
-    clock: ClockName = ""  #: which monotonic clock of the host it is; empty: unknown
+    clock: ClockName = ""  #: identity of that clock, one of the host's monotonic clocks; empty: unknown
 
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """The application holds the authority now."""
+    """The application now holds the authority."""
 
     lease: Count
     until_ns: TimeNs = 0  #: end of the requested time, on the proxy's clock; 0: unlimited
 
 
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """The request is queued. The grant arrives as an event and shows in feedback (``owner_id``, ``lease``)."""
+    """The request is queued. The grant arrives as an event and appears in feedback (``owner_id``, ``lease``)."""
 
     position: Count  #: 1 is next
     holder: str
@@ -170,7 +170,7 @@ class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """A page of the parameters; ``total`` counts all of them, ``first`` is the index of the first one on the page."""
+    """A page of the parameters; ``total`` is the number of all of them, ``first`` the index of the page's first."""
 
     total: Count
     first: Count
@@ -178,7 +178,7 @@ class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
 
 class Pong(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    """The answer to ``Ping``, with its ``sent_ns``; ``now_ns`` is the proxy's clock."""
+    """The answer to ``Ping``, with the same ``sent_ns``; ``now_ns`` is the time on the proxy's clock."""
 
     sent_ns: TimeNs
     now_ns: TimeNs
@@ -189,7 +189,7 @@ class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The request was refused; ``message`` says why, for people."""
+    """The request was refused; ``message`` gives the reason in readable form."""
 
     code: Refusal
     message: str

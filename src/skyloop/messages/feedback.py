@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MAX_LINK_TEXT = 300  #: characters of a text about the vehicle link
+MAX_LINK_TEXT = 300  #: characters in a text about the vehicle link
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
-#: Start of ``link_reason`` while the vehicle still wakes up: the link is connecting or up, but it can't take off yet.
+#: How ``link_reason`` begins while the vehicle is starting up: its link is connecting or up, but it can't take off yet.
 WAKING_UP = "still waking up"
 
 NO_POSITION = "the vehicle does not report its position"
-#: How to give a vehicle its position, for people who read the line above.
+#: How to give a vehicle its position, as advice to someone whose vehicle has none.
 POSITION_SOURCES = (
     "make it available: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
     "GPS, optical flow or motion capture (docs/motion-capture.md)"
@@ -47,37 +47,37 @@ POSITION_SOURCES = (
 class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     """The newest known state of a vehicle.
 
-    A driver fills the first block of fields, the proxy the second. World axes are x east, y north, z up; a vehicle
-    without a compass takes its heading at start as east. Roll is positive right side down, pitch nose down, yaw
+    The driver fills in the first block of fields, the proxy the second. World axes are x east, y north, z up; if a
+    vehicle has no compass, east is its heading at the start. Roll is positive right side down, pitch nose down, yaw
     counter-clockwise from x (ROS REP 103).
     """
 
     captured_ns: TimeNs  #: time of this state, on the proxy's clock
     state: FlightState = FlightState.UNKNOWN
-    battery: Finite | None = None  #: charge left, 0 to 1
-    battery_v: Finite | None = None  #: voltage [V]
-    roll_rad: Finite | None = None  #: [rad]
-    pitch_rad: Finite | None = None  #: [rad]
-    yaw_rad: Finite | None = None  #: [rad]
+    battery: Finite | None = None  #: remaining charge, 0 to 1
+    battery_v: Finite | None = None  #: voltage of the battery [V]
+    roll_rad: Finite | None = None  #: roll [rad]
+    pitch_rad: Finite | None = None  #: pitch [rad]
+    yaw_rad: Finite | None = None  #: yaw [rad]
     altitude_m: Finite | None = None  #: height above the ground below [m]
-    velocity_m_s: Vector | None = None  #: body's levelled axes: forward, left, up [m/s]
-    angular_velocity_rad_s: Vector | None = None  #: about the body's axes [rad/s]
-    acceleration_m_s2: Vector | None = None  #: specific force along the body's axes, gravity included [m/s²]
-    position_m: Vector | None = None  #: in world axes [m], if the vehicle knows its position
+    velocity_m_s: Vector | None = None  #: velocity in the levelled body axes: forward, left, up [m/s]
+    angular_velocity_rad_s: Vector | None = None  #: angular velocity about the body axes [rad/s]
+    acceleration_m_s2: Vector | None = None  #: specific force along the body axes, including gravity [m/s²]
+    position_m: Vector | None = None  #: position in world axes [m], if the vehicle knows it
     native: dict[str, Value] | None = None  #: the vehicle's own telemetry, with its own names and units
 
-    seq: Count = 0  #: grows by one with each sample during a run of the proxy
-    published_ns: TimeNs = 0  #: when the proxy published it
-    vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
+    seq: Count = 0  #: increases by one with each sample during a run of the proxy
+    published_ns: TimeNs = 0  #: when the proxy published the sample
+    vehicle_link: LinkState = LinkState.CONNECTING  #: state of the hop from proxy to vehicle
     owner: str | None = None  #: name of the application that holds the authority
-    owner_id: Count = 0  #: its number in this run of the proxy; 0 for none
+    owner_id: Count = 0  #: number of that application in this run of the proxy; 0 if there is none
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
-    lease: Count = 0  #: number of the lease in force; 0 for none
+    lease: Count = 0  #: number of the lease in force; 0 if there is none
     failsafe: Failsafe = Failsafe.NONE
-    link_reason: LinkText = ""  #: why the hop proxy–vehicle is in this state; while it is up, see :attr:`waking_up`
+    link_reason: LinkText = ""  #: why the vehicle link is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
-    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
-    start_position_m: Vector | None = None  #: where it last took off, in world axes [m]; None: unknown
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
+    start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
     skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
     outcome: Outcome | None = None  #: fate of the newest intent; None: the proxy does not report it
@@ -90,7 +90,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
 
     @property
     def origin(self) -> EarthOrigin | None:
-        """Place on the earth of the origin of the world axes; None where the vehicle does not know it."""
+        """Geographic position of the origin of the world axes; None if the vehicle does not know it."""
         return EarthOrigin.of(self.native)
 
     @property
@@ -115,15 +115,15 @@ _KEYS: Final = (
 
 
 class EarthOrigin(NamedTuple):
-    """The place on the earth of the origin of ``Feedback.position_m``'s axes, x to the east and y to the north.
+    """The geographic position of the origin of ``Feedback.position_m``, whose axes are x east and y north.
 
-    Autopilots use a sphere to project the earth onto their axes. Conversions here use the vehicle's own sphere, so that
-    both mean the same place; with a different one, positions would be off by up to 0.6 % of their distance.
+    Autopilots project the earth onto their axes as a sphere. Conversions here use the vehicle's own sphere, so that
+    both agree; with a different sphere, positions would be off by up to 0.6 % of their distance.
     """
 
-    latitude_deg: float  #: [°], north positive
-    longitude_deg: float  #: [°], east positive
-    altitude_m: float  #: above mean sea level [m]
+    latitude_deg: float  #: latitude [°], north positive
+    longitude_deg: float  #: longitude [°], east positive
+    altitude_m: float  #: altitude above mean sea level [m]
     radius_m: float  #: radius of the sphere that the vehicle uses for the earth [m]
 
     @classmethod
@@ -140,12 +140,12 @@ class EarthOrigin(NamedTuple):
         return dict(zip(_KEYS, self, strict=True))
 
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
-        """Return a place in world axes: x east, y north, z up [m].
+        """Return a geographic position in world axes: x east, y north, z up [m].
 
         Args:
-            latitude_deg: [°], north positive.
-            longitude_deg: [°], east positive; the shorter way round counts.
-            altitude_m: Above mean sea level [m].
+            latitude_deg: Latitude [°], north positive.
+            longitude_deg: Longitude [°], east positive; the shorter way around the earth is used.
+            altitude_m: Altitude above mean sea level [m].
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
@@ -153,7 +153,7 @@ class EarthOrigin(NamedTuple):
         return east_rad * math.cos(middle_rad) * self.radius_m, north_m, altitude_m - self.altitude_m
 
     def place_of(self, position: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return latitude [°], longitude [°] and altitude above mean sea level [m] of a place in world axes [m]."""
+        """Return latitude [°], longitude [°] and altitude above mean sea level [m] of a position in world axes [m]."""
         x, y, z = position
         latitude_deg = self.latitude_deg + math.degrees(y / self.radius_m)
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
@@ -162,61 +162,61 @@ class EarthOrigin(NamedTuple):
 
 
 def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Return whether the place exists and has an east and a north; False for NaN."""
+    """Return whether the position exists and is not a pole, which has no east; False for NaN."""
     return abs(latitude_deg) < 89.9 and abs(longitude_deg) <= 180.0
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True):
-    """One event. ``text`` is for people, ``kind`` and ``data`` for programs."""
+    """One event: ``text`` is for people to read, ``kind`` and ``data`` are for programs."""
 
     kind: EventKind
     text: str
-    at_ns: TimeNs  #: on the proxy's clock
+    at_ns: TimeNs  #: time of the event, on the proxy's clock
     severity: Severity = Severity.INFO
-    seq: Count = 0  #: grows by one during a run of the proxy; 0 for the client's own events
+    seq: Count = 0  #: increases by one with each event during a run of the proxy; 0 for the client's own events
     app: str | None = None  #: name of the application concerned
     data: dict[str, Value] = msgspec.field(default_factory=dict)
 
 
-MAX_ADDRESS: Final = 200  #: characters of a vehicle's address
-MAX_EVENT_TEXT: Final = 200  #: characters of the last event's text
+MAX_ADDRESS: Final = 200  #: characters in a vehicle's address
+MAX_EVENT_TEXT: Final = 200  #: characters in the last event's text
 
 
 class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     """One vehicle's summary. Unknown values are ``None``, as in :class:`Feedback`."""
 
     name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of its proxy
-    uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: its address; cut if it is longer
-    vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: its family
+    uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: the vehicle's address, truncated if longer
+    vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: the vehicle's family
     can_fly: bool = False  #: whether it accepts commands at all
-    captured_ns: TimeNs = 0  #: of its newest feedback, on the proxy's clock; 0: none yet
+    captured_ns: TimeNs = 0  #: capture time of its newest feedback, on the proxy's clock; 0 if there is none yet
     state: FlightState = FlightState.UNKNOWN
-    battery: Finite | None = None  #: charge left, 0 to 1
-    position_m: Vector | None = None  #: in world axes [m]
+    battery: Finite | None = None  #: remaining charge, 0 to 1
+    position_m: Vector | None = None  #: position in world axes [m]
     altitude_m: Finite | None = None  #: height above the ground below [m]
-    yaw_rad: Finite | None = None  #: counter-clockwise from x [rad]
-    vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
-    link_reason: LinkText = ""  #: reason for the link's state; while it is up, why a waking vehicle can't take off yet
+    yaw_rad: Finite | None = None  #: yaw, counter-clockwise from x [rad]
+    vehicle_link: LinkState = LinkState.CONNECTING  #: state of the hop from proxy to vehicle
+    link_reason: LinkText = ""  #: reason for the link's state; while it is up, why the vehicle can't take off yet
     link_remedy: LinkText = ""  #: what a person can do about it
     owner: str | None = None  #: name of the application that holds the authority
     owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     failsafe: Failsafe = Failsafe.NONE
-    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
     return_phase: ReturnPhase = ReturnPhase.NONE
     applications: Count = 0  #: number of connected applications
-    event: Event | None = None  #: the last one, without its data; connects and disconnects of applications are left out
+    event: Event | None = None  #: the last event, without data; connecting and disconnecting applications don't count
 
 
 class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
-    """All vehicles of one process, or of one proxy, by name; split into pages where they exceed one packet.
+    """All vehicles of one process, or of one proxy, by name; split into pages if they exceed one packet.
 
     All pages of one overview have the same ``seq``.
     """
 
     at_ns: TimeNs  #: time of the overview, on the proxy's clock
-    seq: Count  #: grows by one with each overview
+    seq: Count  #: increases by one with each overview
     first: Count = 0  #: index of the first row on this page
-    total: Count = 0  #: rows on all pages
+    total: Count = 0  #: number of rows on all pages
     vehicles: tuple[VehicleOverview, ...] = ()
 
 
@@ -245,7 +245,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as a real vehicle's, for benchmarks.
+    """Return feedback with as many values as from a real vehicle, for benchmarks.
 
     Args:
         captured_ns: Time of capture [ns].

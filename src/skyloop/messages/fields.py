@@ -1,8 +1,8 @@
-"""Types of the samples' fields: bounded numbers, and closed vocabularies.
+"""Types of the fields of samples: bounded numbers and closed vocabularies.
 
-A sample may come from anyone who can connect, and programs use its numbers as sizes, indices, times and loop bounds.
-Therefore they are bounded here, once, on arrival, and not at each place of use. Each member of a vocabulary equals its
-own string, so ``state == "hovering"`` reads well.
+Samples may come from any program that can connect, and their numbers are used as sizes, indices, times and loop bounds.
+Therefore numbers are bounded here, once, on arrival, rather than wherever they are used. Each member of a vocabulary
+equals its own string, so ``state == "hovering"`` works.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Annotated, Final
 
 import msgspec
 
-#: Counters: sequence numbers, leases, numbers of applications. Python's ints are unbounded, others' have 64 bits.
+#: A counter: a sequence number, a lease, an application's number. Python's ints are unbounded, others' have 64 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
-#: 73 years: more than any monotonic clock shows, and small enough that the sum of a time, an offset between two clocks
-#: and the Unix time of their start fits into 64 bits.
+#: Latest time, 73 years: no monotonic clock reaches it, and the sum of a time, an offset between two clocks and the
+#: Unix time of their start still fits into 64 bits.
 LATEST_NS: Final = 2**61
 #: A time on a monotonic clock [ns].
 TimeNs = Annotated[int, msgspec.Meta(ge=-LATEST_NS, le=LATEST_NS)]
@@ -36,23 +36,23 @@ Value = bool | int | float | str | tuple[float, ...]
 
 
 def shape_fits(shape: Sequence[int], count: int, most: int) -> bool:
-    """Return whether an array of this shape has ``count`` elements and no excessively long axis.
+    """Return whether an array of this shape has ``count`` elements and its axes are not excessively long.
 
-    An axis of length 0 makes the product 0 whatever the other lengths are, and a loop over those would never end.
-    Therefore the product that counts each 0 as 1 is bounded, too.
+    A zero makes the product of the lengths 0, however large the others are, and a loop over those would never end.
+    Therefore the product is also bounded with each 0 counted as 1.
 
     Args:
         shape: Length of each axis.
         count: Number of elements.
-        most: Largest product of the lengths, with each 0 counted as 1.
+        most: Maximum product of the lengths, with each 0 counted as 1.
     """
     return math.prod(shape) == count and math.prod(max(1, length) for length in shape) <= most
 
 
 class FlightState(StrEnum):
-    """The vehicle's activity, as the vehicle or its software autopilot reports it."""
+    """The vehicle's activity, as reported by the vehicle or its software autopilot."""
 
-    UNKNOWN = "unknown"  #: nothing received yet
+    UNKNOWN = "unknown"  #: nothing has been received yet
     LANDED = "landed"
     TAKING_OFF = "taking_off"
     HOVERING = "hovering"  #: airborne, holding its position
@@ -70,29 +70,29 @@ _AIRBORNE = frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState
 
 
 class LinkState(StrEnum):
-    """State of one hop (application–proxy, or proxy–vehicle)."""
+    """State of one hop: from application to proxy, or from proxy to vehicle."""
 
     CONNECTING = "connecting"  #: first attempt in progress, nothing received yet
     UP = "up"
     DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
     LOST = "lost"  #: nothing received past the threshold; reconnecting automatically
-    CLOSED = "closed"  #: closed on purpose; nothing more will arrive
+    CLOSED = "closed"  #: closed deliberately; nothing more will arrive
 
 
 class Failsafe(StrEnum):
     """The active step of the failsafe ladder."""
 
     NONE = "none"
-    HOVER = "hover"  #: the pilot is silent or gone: holding the position
-    LAND = "land"  #: still no pilot, or the battery is low: landing
+    HOVER = "hover"  #: holding the position because the pilot is silent or gone
+    LAND = "land"  #: landing because there is still no pilot, or the battery is low
 
 
 class ReturnPhase(StrEnum):
-    """Progress of a vehicle's return to where it took off."""
+    """A vehicle's progress on its return to where it took off."""
 
     NONE = "none"  #: not returning
-    CLIMBING = "climbing"  #: to the height of the return flight
-    FLYING = "flying"  #: towards the start
+    CLIMBING = "climbing"  #: climbing to the height of the return flight
+    FLYING = "flying"  #: flying towards the start
     ARRIVED = "arrived"  #: hovering above the start
     LANDING = "landing"  #: landing at the start
 
@@ -101,7 +101,7 @@ class Encoding(StrEnum):
     """The format of a frame's bytes."""
 
     BGR8 = "bgr8"  #: height × width × 3 bytes, blue first (OpenCV's order), rows without padding
-    RGB8 = "rgb8"  #: the same, red first
+    RGB8 = "rgb8"  #: the same with red first
     MONO8 = "mono8"  #: height × width bytes
     JPEG = "jpeg"  #: one JPEG file
 
@@ -110,14 +110,14 @@ class Role(StrEnum):
     """The role that an application requests when it connects."""
 
     PILOT = "pilot"  #: may request the authority, and may stop the motors in an emergency
-    OBSERVER = "observer"  #: read-only for as long as it is connected
+    OBSERVER = "observer"  #: may only read while it is connected
 
 
 class Takeover(StrEnum):
     """How a request for the authority displaces a holder of lower priority."""
 
-    NOW = "now"  #: at once
-    ASK = "ask"  #: ask the holder first; after a time the higher priority wins
+    NOW = "now"  #: takes it at once
+    ASK = "ask"  #: asks the holder first; after a while the higher priority wins
 
 
 class Severity(StrEnum):
@@ -129,10 +129,10 @@ class Severity(StrEnum):
 
 
 class EventKind(StrEnum):
-    """The kinds of events. Comments name the keys of ``Event.data``."""
+    """The kinds of events. The comments list the keys of ``Event.data``."""
 
-    APPLICATION_LINK = "application_link"  #: the hop application–proxy changed; data: state, reason
-    VEHICLE_LINK = "vehicle_link"  #: the hop proxy–vehicle or its reason changed; data: state, reason, remedy
+    APPLICATION_LINK = "application_link"  #: the link from application to proxy changed; data: state, reason
+    VEHICLE_LINK = "vehicle_link"  #: the link from proxy to vehicle or its reason changed; data: state, reason, remedy
     AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease, identity; until_ns if limited
     AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
@@ -140,7 +140,7 @@ class EventKind(StrEnum):
     AUTHORITY_ASKED = "authority_asked"  #: a request to the holder; data: app_id, lease, by, by_id, by_priority …
     AUTHORITY_DECLINED = "authority_declined"  #: data: app_id (the requester), by (the holder), reason
     AUTHORITY_WITHDRAWN = "authority_withdrawn"  #: the requester gave up; data: app_id (the holder), lease, by, by_id
-    AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and no one waits; data: app_id, lease
+    AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and the queue is empty; data: app_id, lease
     FAILSAFE = "failsafe"  #: a step of the ladder began or ended; data: step, reason
     COMMAND_REFUSED = "command_refused"  #: data: reason (a Refusal), seq, count
     COMMAND_CLAMPED = "command_clamped"  #: a set-point exceeded a limit; data: limit, asked, applied
@@ -150,14 +150,14 @@ class EventKind(StrEnum):
     EMERGENCY = "emergency"  #: motors cut; data: reason
     PARAMETER_CHANGED = "parameter_changed"  #: data: name, value, app_id (who wrote it)
     DRIVER_ERROR = "driver_error"  #: a call of the driver failed; data: where
-    COLLISION = "collision"  #: simulated vehicles only: touched something; data: speed_m_s
+    COLLISION = "collision"  #: a simulated vehicle touched something; data: speed_m_s
     VEHICLE_MESSAGE = "vehicle_message"  #: text from the vehicle itself
-    SAMPLES_LOST = "samples_lost"  #: events that did not reach a slow application; data: count
+    SAMPLES_LOST = "samples_lost"  #: a slow application missed events; data: count
     CALLBACK_ERROR = "callback_error"  #: an application's own callback or processor raised; data: where
     RECORDING = "recording"  #: a recorder started, ended, dropped samples or can't write; data: state, path
     PROCESSOR = "processor"  #: a worker joined, left, or paused; data: processor, state, app_id
-    KEYS = "keys"  #: of the network: a key expires within a week, or the roster has changed
-    PROXY_CLOSING = "proxy_closing"  #: the proxy is shutting down on purpose
+    KEYS = "keys"  #: a key of the network expires within a week, or the roster has changed
+    PROXY_CLOSING = "proxy_closing"  #: the proxy is shutting down deliberately
 
 
 class Refusal(StrEnum):
@@ -167,9 +167,9 @@ class Refusal(StrEnum):
     OUT_OF_SEQUENCE = "out_of_sequence"  #: not newer than the last one received
     STALE = "stale"  #: sent too long ago (or in the future)
     NO_AUTHORITY = "no_authority"  #: the sender holds no lease
-    FOREIGN_LEASE = "foreign_lease"  #: the lease given is not the one in force
+    FOREIGN_LEASE = "foreign_lease"  #: the given lease is not the one in force
     NON_FINITE = "non_finite"  #: NaN or infinite
-    NOT_FRESH = "not_fresh"  #: repeats an intent from before a failsafe or a loss of the vehicle link
+    NOT_FRESH = "not_fresh"  #: repeats an intent older than a failsafe or a loss of the vehicle link
     VEHICLE_LINK_LOST = "vehicle_link_lost"
     UNSUPPORTED = "unsupported"  #: neither the vehicle nor the software autopilot supports it
     WRONG_STATE = "wrong_state"  #: not possible in the present flight state
@@ -179,6 +179,6 @@ class Refusal(StrEnum):
     OUT_OF_RANGE = "out_of_range"
     READ_ONLY = "read_only"
     DRIVER_FAILED = "driver_failed"
-    BUSY = "busy"  #: an application of at least the same priority holds the authority
-    NAME_TAKEN = "name_taken"  #: the name belongs to other code, or to another way of sharing
+    BUSY = "busy"  #: an application with at least the same priority holds the authority
+    NAME_TAKEN = "name_taken"  #: the name is in use by other code, or for another way of sharing
     PROTOCOL = "protocol"  #: a request out of order, or of another protocol version

@@ -1,4 +1,4 @@
-"""Video samples: headers of frames, encoded pictures of a stream, and the size of image files.
+"""Video samples: frame headers and the encoded pictures of streams; also, the size of image files.
 
 A stream holds pictures as the vehicle sent them, or as the proxy encoded them. It runs only while it has subscribers.
 """
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 H264: Final = "h264"  #: the only codec that is recorded without decoding
-#: Bytes of a picture that fit into a packet beside the other fields.
+#: Maximum number of a picture's bytes in one packet, which also holds the other fields.
 MAX_PIECE: Final = 57_000
 MAX_PIECES: Final = 64
-MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: bytes of a whole picture
+MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a whole picture [bytes]
 Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
@@ -48,13 +48,13 @@ class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
     """Header of one frame; the pixels are sent separately."""
 
     camera: Name
-    seq: Count  #: grows by one with each frame of this camera, dropped ones included
+    seq: Count  #: increases by one with each frame of this camera, including dropped ones
     captured_ns: TimeNs  #: middle of the exposure, as accurately as the vehicle reports it, on the proxy's clock
     published_ns: TimeNs  #: when the proxy received it
     width: Pixels
     height: Pixels
     encoding: Encoding
-    size: Count  #: bytes of pixels
+    size: Count  #: number of bytes of pixels
     intrinsics: Intrinsics | None = None
 
 
@@ -64,55 +64,55 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     name: Name
     width: Pixels
     height: Pixels
-    fps: Finite  #: nominal
+    fps: Finite  #: nominal frame rate
     encoding: Encoding = Encoding.BGR8
     intrinsics: Intrinsics | None = None
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
-    position_m: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
-    stream: str = ""  #: codec in which the pictures are available undecoded, ``h264``; empty: frames only
+    position_m: tuple[Finite, Finite, Finite] | None = None  #: position of the optical centre in body axes [m]
+    stream: str = ""  #: codec in which pictures are available undecoded, ``h264``; empty if there are only frames
 
 
 class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
-    """One picture; in H.264, an access unit in Annex B form, with its parameter sets if it is a key picture.
+    """One picture; for H.264, an access unit in Annex B format, with its parameter sets if it is a key picture.
 
-    A picture larger than a packet is sent in pieces, each an ``EncodedFrame``. Each but a key picture refers to
-    the previous one, so nothing after a gap in ``seq`` can be decoded before the next key picture. No picture refers to
-    a later one. A frame decoded from it has the same ``captured_ns``, and its own ``seq``.
+    A picture larger than a packet is sent in pieces, each an ``EncodedFrame``. Every picture except a key picture
+    refers to the previous one, so after a gap in ``seq`` nothing can be decoded before the next key picture. No picture
+    refers to a later one. A frame decoded from it has the same ``captured_ns``, and a ``seq`` of its own.
     """
 
     camera: Name
-    seq: Count  #: grows by one with each picture of the stream, those too large for a packet included
-    captured_ns: TimeNs  #: as in the decoded frame
+    seq: Count  #: increases by one with each picture of the stream, including those larger than a packet
+    captured_ns: TimeNs  #: the same as in the decoded frame
     published_ns: TimeNs  #: when the proxy received it
-    width: Pixels  #: of the decoded picture
+    width: Pixels  #: width of the decoded picture
     height: Pixels
     codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
-    key: bool  #: decodable without earlier pictures
-    data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: at most :data:`MAX_PIECE` bytes of them in a packet
+    key: bool  #: whether it can be decoded without earlier pictures
+    data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: one packet holds at most :data:`MAX_PIECE` bytes
     intrinsics: Intrinsics | None = None
-    topic: Topic = ""  #: topic it was published on; empty: ``stream/CAMERA``, as the vehicle encoded it
+    topic: Topic = ""  #: topic of the picture; empty: ``stream/CAMERA``, as the vehicle encoded it
     piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
     pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
 
     def decoded(self, width: int, height: int) -> FrameHeader:
-        """Return the header of the frame decoded from this picture, in BGR and of this size [px]."""
+        """Return the header of the frame decoded from this picture, a BGR image of this size [px]."""
         same = (width, height) == (self.width, self.height)
         times = (self.captured_ns, self.published_ns)
-        lens = self.intrinsics if same else None  # the intrinsics hold for the announced size
+        lens = self.intrinsics if same else None  # the intrinsics are valid for the announced size
         return FrameHeader(self.camera, self.seq, *times, width, height, Encoding.BGR8, width * height * 3, lens)
 
 
 class StreamReport(msgspec.Struct, frozen=True, array_like=True):
-    """A subscriber's report on a stream that the proxy encodes. It may be lost: a later one replaces it."""
+    """A subscriber's report on a stream that the proxy encodes. If it is lost, the next one makes up for it."""
 
     topic: Topic
-    seq: Count  #: newest picture received whole; 0: none yet
+    seq: Count  #: number of the newest picture received whole; 0 if there is none yet
     wants_key: bool = False  #: whether the subscriber can decode nothing before the next key picture
 
 
 def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
-    """Yield the pieces of a picture in order; the picture itself if it fits a packet.
+    """Yield the pieces of a picture in order, or the picture itself if it fits into a packet.
 
     Args:
         picture: A whole picture, of at most :data:`MAX_ENCODED` bytes.
@@ -133,7 +133,7 @@ class Pieces:
         self._parts: list[EncodedFrame] = []
 
     def add(self, part: EncodedFrame) -> EncodedFrame | None:
-        """Add a piece; return the picture if it is complete now."""
+        """Add a piece; return the picture if this completes it."""
         if part.pieces == 1:
             self._parts.clear()
             return part
@@ -152,10 +152,10 @@ class Pieces:
 
 
 class Chain:
-    """Decides which pictures of a stream are decodable: a key picture, and its successors without a gap."""
+    """Decides which pictures of a stream are decodable: key pictures, and those that follow without a gap."""
 
     def __init__(self) -> None:
-        self._last: int | None = None  # None: wait for a key picture
+        self._last: int | None = None  # None while waiting for a key picture
 
     def follows(self, number: int, *, key: bool) -> bool:
         """Return whether the next picture received can be decoded; False for duplicates.
@@ -171,16 +171,16 @@ class Chain:
         return whole
 
     def restart(self) -> None:
-        """Start over: the next picture does not continue the previous ones."""
+        """Start over, because the next picture does not continue the previous ones."""
         self._last = None
 
 
 # The size is read from a JPEG's or PNG's header before decoding: decoders reserve memory for the announced size, so a
 # file of a few kilobytes could claim gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
 
-#: Largest picture that is decoded: 8K UHD, 100 MB as BGR, far beyond any camera of a small drone.
+#: Maximum size of a picture to decode: 8K UHD (100 MB as BGR), far more than any small drone's camera has.
 MAX_PIXELS: Final = 7680 * 4320
-#: Scans of a progressive JPEG, each of which covers the whole picture; encoders make about ten.
+#: Maximum number of scans in a progressive JPEG, each of which covers the whole picture; encoders make about ten.
 MAX_SCANS: Final = 100
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -188,7 +188,7 @@ _JPEG: Final = b"\xff\xd8"
 _SCAN: Final = b"\xff\xda"
 _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD8)})
-_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: no header continues after a second start, the end, or the first scan
+_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: markers that end a header: a second start, the end, or the first scan
 
 
 def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
@@ -208,7 +208,7 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
 
 
 def why_not_decoded(data: bytes | memoryview) -> str:
-    """Return why a picture must not be decoded; empty if it may be."""
+    """Return why a picture must not be decoded; empty if it may."""
     size = image_size(data)
     if size is None:
         return "it is neither JPEG nor PNG, or it is damaged"

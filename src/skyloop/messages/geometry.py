@@ -1,6 +1,6 @@
-"""Pure functions for bounded numbers, angles, rotation matrices and quaternions, with the axes of ROS REP 103.
+"""Pure functions for bounded numbers, angles, rotation matrices and quaternions, in the axes of ROS REP 103.
 
-NaN never passes a limit: it counts as 0, or as the number in the range nearest to 0.
+Limits never let NaN through: it counts as 0, or as the number nearest to 0 within the range.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, fl
 
 
 def wrap_angle(angle: _Angle) -> _Angle:
-    """Return the same angle, or angles in an array, within [-π, π) [rad]."""
+    """Wrap an angle, or each angle in an array, to [-π, π) [rad]."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:
-    """Rotate a vector counter-clockwise [rad]; by the yaw, from levelled body axes to world axes."""
+    """Rotate a vector counter-clockwise [rad]; if the angle is the yaw, from levelled body axes to world axes."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos * x - sin * y, sin * x + cos * y
 

@@ -1,6 +1,6 @@
-"""Parameters, and two read-only ones with structured text: a vehicle's checkup, and its world.
+"""Parameters, two of which are read-only and hold structured text: a vehicle's checkup, and its world.
 
-A parameter has a type, a unit, a range and a default, so that a page or a person can edit it.
+A parameter has a type, a unit, a range and a default, so that both people and web pages can edit it.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     name: ParameterName
     type: ParameterType
     value: Value
-    unit: str = ""  #: SI symbol, e.g. ``rad``; empty for none
+    unit: str = ""  #: SI symbol of the unit, e.g. ``rad``; empty if there is none
     minimum: float | None = None
     maximum: float | None = None
     default: Value | None = None
-    choices: tuple[Value, ...] = ()  #: if not empty, the only values allowed
+    choices: tuple[Value, ...] = ()  #: the only allowed values, if not empty
     read_only: bool = False
     description: str = ""
     momentary: bool = False  #: writing it triggers an action such as a flip; there is no value to restore or repeat
 
 
-# A driver's findings about its vehicle before a flight.
+# What a driver finds out about its vehicle before a flight.
 
 CHECKUP: Final = "vehicle.checkup"  #: the parameter's name
-MAX_CHECKUP_TEXT: Final = 7000  #: characters of the text, so that a parameter's packet can hold it
+MAX_CHECKUP_TEXT: Final = 7000  #: characters in the text, so that it fits into a parameter's packet
 
 _Text = Annotated[str, msgspec.Meta(max_length=600)]
 
@@ -55,10 +55,10 @@ class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
     """A finding about a vehicle or its settings that matters before a flight.
 
     Attributes:
-        what: The subject of the examination.
+        what: What was examined.
         good: Whether the result is good.
         detail: The result.
-        advice: What to do about it; empty if nothing.
+        advice: What to do about it; empty if there is nothing to do.
         severe: Whether it is dangerous or sure to fail, rather than just a disabled safety net.
     """
 
@@ -73,7 +73,7 @@ _checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
 
 
 def encode_checkup(diagnostics: list[Diagnostic]) -> str:
-    """Return diagnostics as a parameter's text; if it is too long, the good ones are left out first."""
+    """Encode diagnostics as a parameter's text; if it gets too long, leave out good ones first."""
     kept = list(diagnostics)
     while len(text := _encode_json(kept).decode()) > MAX_CHECKUP_TEXT:
         kept.remove(next((one for one in reversed(kept) if one.good), kept[-1]))
@@ -81,7 +81,7 @@ def encode_checkup(diagnostics: list[Diagnostic]) -> str:
 
 
 def decode_checkup(text: str) -> list[Diagnostic]:
-    """Return the diagnostics of a parameter's text.
+    """Decode the diagnostics in a parameter's text.
 
     Raises:
         ValueError: The text holds none.
@@ -91,11 +91,11 @@ def decode_checkup(text: str) -> list[Diagnostic]:
 
 # A vehicle's world, for maps: walls, solids, gates, markers, starts; published by drivers that know their surroundings.
 # World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east, counter-clockwise [rad].
-# It is for display only: nothing is steered by it.
+# It is for display only, never for control.
 
 WORLD: Final = "world.geometry"  #: the parameter's name
-MAX_WORLD_TEXT: Final = 8000  #: characters of the text, so that a parameter's packet can hold it
-MAX_THINGS: Final = 256  #: of each kind
+MAX_WORLD_TEXT: Final = 8000  #: characters in the text, so that it fits into a parameter's packet
+MAX_THINGS: Final = 256  #: maximum number of objects of each kind
 
 _Name = Annotated[str, msgspec.Meta(max_length=64)]
 _Vec = tuple[Finite, Finite, Finite]
@@ -131,7 +131,7 @@ class Card(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Start(msgspec.Struct, frozen=True, array_like=True):
-    """A vehicle's position and heading at the start."""
+    """Where a vehicle starts: its position and heading."""
 
     name: _Name
     position: _Vec
@@ -139,7 +139,7 @@ class Start(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WorldGeometry(msgspec.Struct, frozen=True):
-    """The whole world. ``low`` and ``high`` are corners of the room; ``enclosed``: it has visible walls."""
+    """The whole world. ``low`` and ``high`` are corners of the room; ``enclosed`` means that it has visible walls."""
 
     name: _Name = ""
     low: _Vec | None = None
@@ -149,14 +149,14 @@ class WorldGeometry(msgspec.Struct, frozen=True):
     gates: Annotated[tuple[Opening, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     markers: Annotated[tuple[Card, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     starts: Annotated[tuple[Start, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
-    left_out: int = 0  #: number of things that the text has no room for
+    left_out: int = 0  #: number of objects left out because the text has no room for them
 
 
 _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Return a world as a parameter's text; if it is too long, the last solids and markers are left out."""
+    """Encode a world as a parameter's text; if it gets too long, leave out the last solids and markers."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)
@@ -167,7 +167,7 @@ def encode_world(world: WorldGeometry) -> str:
 
 
 def decode_world(text: str) -> WorldGeometry:
-    """Return the world of a parameter's text.
+    """Decode the world in a parameter's text.
 
     Raises:
         ValueError: The text is not a world.

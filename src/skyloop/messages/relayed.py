@@ -1,4 +1,4 @@
-"""Samples that applications publish through the proxy: annotations of frames, log entries, processors' results.
+"""Samples that applications publish through the proxy: frame annotations, log entries and processors' results.
 
 The proxy relays them on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
 """
@@ -15,8 +15,8 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: drawings of a controller or processor on a frame, for people and recorders; the newest wins. Coordinates
-# are pixels of that frame.
+# Annotations: drawings by a controller or processor on a frame, for people and recorders; the newest wins. Coordinates
+# are in pixels of that frame.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -40,7 +40,7 @@ class Points(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
 
 class Text(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """A text beside a point."""
+    """A text next to a point."""
 
     text: Annotated[str, msgspec.Meta(max_length=256)]
     at: Point
@@ -51,9 +51,9 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
-    source: Name  #: the tracker or controller that drew it; only the newest per source and camera counts
+    source: Name  #: the tracker or controller that drew it; for each source and camera, only the newest counts
     camera: Name
-    captured_ns: TimeNs  #: of the annotated frame
+    captured_ns: TimeNs  #: capture time of the annotated frame
     width: Pixels  #: width of that frame
     height: Pixels
     shapes: Annotated[tuple[Shape, ...], msgspec.Meta(max_length=256)] = ()
@@ -61,26 +61,26 @@ class Annotation(msgspec.Struct, frozen=True, array_like=True):
 
 # Log entries: text, numbers and arrays, for recorders and plots.
 
-MAX_LOG_TEXT: Final = 4096  #: characters
-MAX_VALUES: Final = 4096  #: numbers of an array
-#: The series of poses from motion capture, in world axes: arrays of x, y, z [m], quaternion x, y, z, w, and velocity
-#: x, y, z [m/s] if known.
+MAX_LOG_TEXT: Final = 4096  #: characters in a log entry's text
+MAX_VALUES: Final = 4096  #: numbers in an array
+#: Name of the series of poses from motion capture, in world axes: arrays of x, y, z [m], the quaternion x, y, z, w and,
+#: if known, the velocity x, y, z [m/s].
 MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):
-    """One entry, with exactly one of ``text``, ``number`` and ``values``.
+    """One entry, which has exactly one of ``text``, ``number`` and ``values``.
 
-    Raises ``ValueError`` for none or several of them, and for a shape that does not match the values.
+    Raises ``ValueError`` if it has none or several of them, or if the shape does not match the values.
     """
 
-    source: Name  #: the application, or its part, that logged the entry
+    source: Name  #: the application, or the part of it, that logged the entry
     name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text outside any series
     at_ns: TimeNs  #: when it was logged, on the proxy's clock
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
     values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: an array, row by row
-    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: of that array
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: shape of that array
     severity: Severity = Severity.INFO  #: severity of a text
 
     def __post_init__(self) -> None:
@@ -91,11 +91,11 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
             raise ValueError(f"a log entry of {len(values or ())} values can't have the shape {self.shape!r:.200}")
 
 
-# Results: a processor's output for one frame, and how the workers of a processor share the frames.
+# Results: a processor's output for one frame, and how a processor's workers share the frames.
 
 MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
 MAX_CODE: Final = 128  #: characters that identify a processor's code
-MAX_PARTS: Final = 1024  #: shares of a camera's frames, one per worker
+MAX_PARTS: Final = 1024  #: maximum number of shares of a camera's frames, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
 
@@ -105,11 +105,11 @@ class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
 
     processor: ProcessorName
     camera: Name
-    seq: Count  #: of the frame
-    captured_ns: TimeNs  #: of the frame
+    seq: Count  #: number of the frame
+    captured_ns: TimeNs  #: capture time of the frame
     made_ns: TimeNs  #: when the result was ready, on the proxy's clock
     took_ns: Count  #: duration of the worker's ``process`` [ns]
-    number: Count  #: grows by one with each result of a worker
+    number: Count  #: increases by one with each result of a worker
     payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
     worker: Count = 0  #: number of the sending application; the proxy overwrites it
 
@@ -119,24 +119,24 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 
     processor: ProcessorName
     camera: Name
-    part: Count  #: from 0
-    #: 0: no frames, as the worker reported that it can't take any; 1: every frame
+    part: Count  #: number of the share, from 0
+    #: number of shares; 1: every frame; 0: no frames, because the worker reported that it can't take any
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
-    workers: Count  #: of this processor and camera, paused ones included
+    workers: Count  #: number of workers for this processor and camera, including paused ones
 
     def __post_init__(self) -> None:
         if self.part >= max(1, self.parts):
             raise ValueError(f"part is {self.part} and must be below parts ({self.parts}), or 0")
 
 
-# A result's value is one MessagePack value. A NumPy array is extension type 1, whose bytes are a MessagePack array of
-# its type's name, its shape and its elements (little-endian, row by row). A dataclass or `msgspec.Struct` is encoded
-# as a map and decoded as a dict.
+# A result's value is one MessagePack value. A NumPy array becomes extension type 1, whose bytes are a MessagePack array
+# with the name of its type, its shape and its elements (little-endian, row by row). A dataclass or `msgspec.Struct` is
+# encoded as a map and decoded as a dict.
 
-ARRAY: Final = 1  #: extension type
+ARRAY: Final = 1  #: the extension type of arrays
 MAX_DIMENSIONS: Final = 8
-MAX_DEPTH: Final = 32  #: of nested lists and maps, so that walking a value needs a bounded stack
-#: Element types that arrays may have: those that are the same on every machine.
+MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that walking a value needs a bounded stack
+#: Allowed element types of arrays: those that are the same on every machine.
 DTYPES: Final = (
     "bool",
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
@@ -179,7 +179,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(payload: bytes) -> Any:
-    """Decode a payload; arrays are read-only, tuples come back as lists.
+    """Decode a payload; arrays are read-only, and tuples become lists.
 
     Raises:
         DecodeError: :func:`pack` could not have encoded these bytes.

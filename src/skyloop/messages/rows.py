@@ -31,9 +31,9 @@ _NUMBERS: Final[dict[str, _Number]] = {
     "velocity_up_m_s": _part(lambda feedback: feedback.velocity_m_s, 2),
 }
 
-#: A drone's own state, in the axes and units of :class:`Feedback`.
+#: Names of the numbers in a drone's own state, which have the axes and units of :class:`Feedback`.
 STATE: Final = tuple(_NUMBERS)
-#: The numbers of an application's set-points, by the set-point's name.
+#: Names of the numbers in an application's set-points, by the set-point's name.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
     "attitude": ("roll", "pitch", "climb", "yaw_rate"),
@@ -45,10 +45,10 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
     Args:
         feedback: The state.
-        names: Names of numbers, from :data:`STATE`.
+        names: Names of the numbers to return, from :data:`STATE`.
 
     Returns:
-        The numbers in the order of the names; None if one of them is unknown.
+        The numbers, in the order of their names; None if any is unknown.
 
     Raises:
         UnknownNameError: A name is not in :data:`STATE`.
@@ -65,7 +65,7 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
 
 def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
-    """Return the set-point of a row.
+    """Return the set-point in a row.
 
     Args:
         kind: A key of :data:`ACTIONS`.

@@ -16,17 +16,17 @@ from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
-MIN_HZ: Final = 0.001  #: one sample in a quarter of an hour; keeps the period finite
+MIN_HZ: Final = 0.001  #: lowest rate, one sample in a quarter of an hour, so that the period stays finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
-TOLERANCE: Final = 0.1  #: of a period: a sample early by up to this much is still in time
+TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be early
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
-MIN_KBIT_S: Final = 30  #: of a stream that the proxy encodes
+MIN_KBIT_S: Final = 30  #: lowest rate of a stream that the proxy encodes
 MAX_KBIT_S: Final = 50_000
-MAX_SUBSCRIBER: Final = 32  #: characters
-MIN_FPS: Final = 0.001  #: one frame in a quarter of an hour; keeps the period finite
+MAX_SUBSCRIBER: Final = 32  #: characters in a subscriber's name
+MIN_FPS: Final = 0.001  #: lowest rate, one frame in a quarter of an hour, so that the period stays finite
 _ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
 _STREAM_PREFIX: Final = "stream/"
@@ -35,15 +35,15 @@ _FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "
 
 @dataclass(frozen=True, slots=True)
 class FeedbackRequest:
-    """Feedback as one consumer requests it.
+    """One consumer's request for feedback.
 
     Requests for the same samples are equal and have the same :attr:`topic`.
 
     Raises:
-        UsageError: ``max_hz`` is not within :data:`MIN_HZ` and :data:`MAX_HZ`.
+        UsageError: ``max_hz`` is not between :data:`MIN_HZ` and :data:`MAX_HZ`.
     """
 
-    max_hz: float | None = None  #: most samples a second; None: all
+    max_hz: float | None = None  #: maximum number of samples a second; None: all
 
     def __post_init__(self) -> None:
         rate = self.max_hz
@@ -51,12 +51,12 @@ class FeedbackRequest:
             known = isinstance(rate, int | float) and not isinstance(rate, bool)
             if not (known and MIN_HZ <= rate <= MAX_HZ):
                 raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
-            # As it is written in a topic, so that both ends have an equal request.
+            # Round the rate as in a topic, so that the requests at both ends are equal.
             object.__setattr__(self, "max_hz", float(f"{rate:g}"))
 
     @property
     def is_plain(self) -> bool:
-        """Whether it asks for every sample."""
+        """Whether it includes every sample."""
         return self.max_hz is None
 
     @property
@@ -66,17 +66,17 @@ class FeedbackRequest:
 
     @property
     def period_s(self) -> float:
-        """Shortest time between two samples [s]; 0 for all samples."""
+        """Minimum time between two samples [s]; 0 if all samples are requested."""
         return 0.0 if self.max_hz is None else 1.0 / self.max_hz
 
     @classmethod
     def parse(cls, topic: str) -> Self:
-        """Parse a topic, which must be written exactly as :attr:`topic` writes it.
+        """Parse a topic, which must have exactly the form of :attr:`topic`.
 
-        So each request has one topic, and is encoded once.
+        This way each request has only one topic, and is encoded once.
 
         Raises:
-            UsageError: The topic is not one of feedback, or is written differently.
+            UsageError: The topic is not a feedback topic, or has another form.
         """
         if topic == FEEDBACK:
             return cls()
@@ -91,7 +91,7 @@ class FeedbackRequest:
         return request
 
     def union(self, other: FeedbackRequest) -> FeedbackRequest:
-        """Return the smallest request that covers both."""
+        """Return the smallest request that includes both."""
         if self.max_hz is None or other.max_hz is None:
             return PLAIN
         return self if self.max_hz >= other.max_hz else other
@@ -102,7 +102,7 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """Frames of one camera as one consumer requests them.
+    """One consumer's request for a camera's frames.
 
     H.264 has its own topic, :attr:`stream_topic`.
 
@@ -113,13 +113,13 @@ class VideoRequest:
     """
 
     camera: str
-    encoding: VideoEncoding = "raw"  #: encoding of the pixels where they must be sent: unchanged, JPEG or H.264
-    quality: int = DEFAULT_QUALITY  #: of a JPEG, 1 to 100
-    max_fps: float | None = None  #: most frames a second
-    scale: float = 1.0  #: factor of width and height, above 0 and up to 1
+    encoding: VideoEncoding = "raw"  #: encoding of the pixels if they must be sent: unchanged, JPEG or H.264
+    quality: int = DEFAULT_QUALITY  #: JPEG quality, 1 to 100
+    max_fps: float | None = None  #: maximum number of frames a second; None: all
+    scale: float = 1.0  #: factor for width and height, greater than 0 and at most 1
     part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n is k
-    kbit_s: int | None = None  #: average of H.264; None: as the vehicle sent it, or as much as the path carries
-    subscriber: str = ""  #: for H.264 whose rate follows the path to one subscriber: its unique name
+    kbit_s: int | None = None  #: average H.264 rate; None: as the vehicle sent it, or as much as the path can carry
+    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to its path
 
     def __post_init__(self) -> None:
         if not self.camera:
@@ -138,7 +138,7 @@ class VideoRequest:
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         self._check_stream()
         if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused here; the default keeps equal requests equal
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; by this, equivalent requests are equal
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
@@ -185,7 +185,7 @@ class VideoRequest:
     def stream_topic(self) -> str:
         """The topic of the request's H.264, e.g. ``stream/front?kbit_s=500``.
 
-        Without options it is the vehicle's own stream.
+        Without options, it is the vehicle's own stream.
         """
         variant = self._variant("")
         return f"{_STREAM_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
@@ -197,10 +197,10 @@ class VideoRequest:
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """Parse a topic of video.
+        """Parse a video topic.
 
         Raises:
-            UsageError: The topic is not one of a camera's frames.
+            UsageError: The topic does not belong to a camera's frames.
         """
         prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
         camera, _, variant = topic.removeprefix(prefix).partition("?")
@@ -216,12 +216,12 @@ class VideoRequest:
 
 
 class FrameFilter:
-    """Selects a request's frames from those of one camera, by number and capture time.
+    """Selects the frames for a request from those of one camera, by number and capture time.
 
     It keeps state, so each stream of frames needs its own.
 
     Args:
-        request: Only its ``part`` and ``max_fps`` count.
+        request: The request, of which only ``part`` and ``max_fps`` are used.
     """
 
     def __init__(self, request: VideoRequest) -> None:
@@ -233,7 +233,7 @@ class FrameFilter:
 
         Args:
             seq: The frame's number.
-            captured_ns: Its capture time, on any one clock [ns].
+            captured_ns: Its capture time [ns], on any clock as long as it is always the same.
         """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
@@ -241,7 +241,7 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Thins out one series of samples to an average rate.
+    """Reduces one series of samples to an average rate.
 
     It keeps state, so each series and each consumer needs its own.
     """
@@ -250,7 +250,7 @@ class RateLimiter:
         """Keep the first sample that arrives.
 
         Args:
-            max_hz: Maximum rate, above 0; None: keep all.
+            max_hz: Maximum rate, greater than 0; None: keep all samples.
         """
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
@@ -268,12 +268,12 @@ class RateLimiter:
         """Return whether to keep a sample. Call it once for each sample, in order.
 
         Args:
-            at_ns: Its time, on any one clock.
+            at_ns: Its time [ns], on any clock as long as it is always the same.
         """
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
             return True
-        # A time long before the last one belongs to another run of the source: restart.
+        # A time long before the last one means that the source has been restarted: start over.
         if due_ns is None or at_ns < due_ns - 2 * period_ns or at_ns >= due_ns + period_ns:
             self._due_ns = at_ns + period_ns
             return True

@@ -1,4 +1,4 @@
-"""The proxy: authority, command checks, failsafe ladder, limits, parameters and software autopilot of one vehicle.
+"""The proxy for one vehicle: authority, command checks, failsafe ladder, limits, parameters, software autopilot.
 
 The rules are in ``docs/proxy.md``. :class:`Proxy` runs in any process; the command line uses
 :func:`skyloop.proxy.serve.serve`.

@@ -1,7 +1,7 @@
-"""The proxy's reports about itself: numbered events for all clients, and counters on request.
+"""What a proxy reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, then its input: event drafts, created by pure functions, those about commands, failsafe and
-ownership before those about the authority.
+The publisher comes first, followed by its input: event drafts, which pure functions create, first about commands,
+failsafe and ownership, then about the authority.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
 
-#: Number of command delays in the distribution: about a minute of one pilot at 32 Hz.
+#: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
-MAX_TEXT: Final = 1000  #: characters of an event's text
-REPEAT_NS: Final = NS_PER_S  #: how often a continuing event is published again
-#: A limit untouched for this long starts a new episode when it is touched again.
+MAX_TEXT: Final = 1000  #: characters in an event's text
+REPEAT_NS: Final = NS_PER_S  #: how often an event that continues is published again
+#: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
-#: Why a hover or a landing is abandoned.
+#: Why a hover or landing is abandoned.
 UNHEARD: Final = f"the vehicle was silent for {seconds(BELIEF_NS):g} s and may be on another flight by now"
 _ENFORCED: Final = "enforced: the vehicle's position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is unknown"
@@ -38,14 +38,14 @@ _log = logging.getLogger(__name__)
 
 
 class Counters:
-    """Counts and the recent command delays. Each name is counted under one lock only, or by one thread."""
+    """Counts, and the recent command delays. Each name is counted under a single lock, or by a single thread."""
 
     def __init__(self) -> None:
         self.counts: defaultdict[str, int] = defaultdict(int)
-        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: from sending to applying, for accepted commands
+        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: delays of accepted commands, from sending to applying
 
     def snapshot(self, **now: float) -> dict[str, float]:
-        """Return all counters, the distribution of the command delay [s], and the caller's additions."""
+        """Return all counters, the distribution of command delays [s], and the caller's additions."""
         values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
         values.update(now)
         delays = sorted(self.delays_ns.copy())
@@ -73,12 +73,12 @@ class EventPublisher:
         self._publish = publish
         self._clock = clock
         self._counts = counters.counts
-        self._lock = threading.Lock()  # keeps events in the order of their numbers
+        self._lock = threading.Lock()  # keeps events in order of their numbers
         self._seq = 0
         self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
-        self.last: Event | None = None  #: the newest one other than applications' connects and disconnects
+        self.last: Event | None = None  #: the newest event, not counting applications that connect or disconnect
 
     def publish(
         self,
@@ -107,7 +107,7 @@ class EventPublisher:
                 self._send([replace(draft, data={**draft.data, "count": 1})])
 
     def tick(self, now_ns: int) -> None:
-        """Publish sums of repeated and of undelivered events. Call several times a second."""
+        """Publish how many events were repeated or not delivered. Call several times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
@@ -116,10 +116,10 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # this event itself may get lost without another one
+                self._missed = 0  # if this event itself gets lost, no further one reports that
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
-        """Number and publish; the lock is held."""
+        """Number events and publish them. The lock is held."""
         scrub, packets = self._scrub, []
         told = [
             (one, scrub(one.text), {key: scrub(it) if isinstance(it, str) else it for key, it in one.data.items()})
@@ -161,9 +161,9 @@ class EventDraft:
 
 
 class RepeatedEvents:
-    """Decides when to publish events that may occur many times a second: the first at once, then sums once a second.
+    """Decides when to publish events that may occur many times a second: the first at once, then totals once a second.
 
-    A sum has the text of the newest event, because the reason of a refusal may change between repeats.
+    A total has the text of the newest event, because the reason for a refusal may change between repeats.
     """
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class RepeatedEvents:
         self._counts: dict[Hashable, int] = {}
 
     def first(self, key: Hashable, draft: Callable[[], EventDraft]) -> bool:
-        """Count an event; return whether it is the first of its key: then publish it and call :meth:`begin`."""
+        """Count an event; return whether it is the first with its key. If so, publish it and call :meth:`begin`."""
         count = self._counts.get(key)
         if count is None:
             return True
@@ -180,12 +180,12 @@ class RepeatedEvents:
         return False
 
     def begin(self, key: Hashable, draft: Callable[[], EventDraft], now_ns: int) -> None:
-        """Note that the first of its key, or a sum, was published."""
+        """Record that the first event with this key, or a total, was published."""
         self._published[key] = (now_ns, draft)
         self._counts[key] = 0
 
     def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
-        """Return the events repeated in the second since they were last published, with counts; forget the others."""
+        """Return events repeated in the second since they were last published, with counts; forget the others."""
         due: list[tuple[EventDraft, int]] = []
         for key, (published_ns, draft) in list(self._published.items()):
             if now_ns - published_ns < REPEAT_NS:
@@ -200,7 +200,7 @@ class RepeatedEvents:
 
 
 class Episodes:
-    """The limits touched at present, so that each is published once, not with every repeat of a set-point."""
+    """Keeps track of the limits being touched, so that each is published once, not at every repeat of a set-point."""
 
     def __init__(self) -> None:
         self._touched_ns: dict[tuple[str, str], int] = {}
@@ -215,13 +215,13 @@ class Episodes:
 
 
 def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
-    """Return the event of a refused command of the application ``name``."""
+    """Return the event for a refused command from the application ``name``."""
     text = f"{name}: {command.action.name} refused: {why}"
     return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
 
 
 def clamped_event(name: str, clamp: Clamp) -> EventDraft:
-    """Return the event of a limit that shortened a set-point of the application ``name``."""
+    """Return the event for a limit that reduced a set-point from the application ``name``."""
     zone = f" ({clamp.zone})" if clamp.zone else ""
     text = f"{name}: {clamp.limit}{zone} allows {clamp.applied:.3g} of {clamp.asked:.3g}"
     data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
@@ -231,21 +231,21 @@ def clamped_event(name: str, clamp: Clamp) -> EventDraft:
 
 
 def enforcement_event(enforced: bool) -> EventDraft:
-    """Return the event for a change in whether the safety box and zones are enforced."""
+    """Return the event for starting or ceasing to enforce the safety box and zones."""
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
 
 
 def thin_zones_event(space: Space) -> EventDraft:
-    """Return the event of zones that are enforced as if they were thicker."""
+    """Return the event for zones that are enforced as if they were thicker."""
     thin = "; ".join(str(zone) for zone in space.thin)
     text = f"no-fly zones thinner than {THINNEST_M:g} m are enforced as if they were that thick: {thin} ({ZONES})"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data={"reason": "thin_zones"})
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event of a position change larger than any flight; ``lands``: the vehicle was landing."""
+    """Return the event for a position that changed by more than flying can explain; ``lands``: it was landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
@@ -253,13 +253,13 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
 
 
 def given_up_event(what: str) -> EventDraft:
-    """Return the event of a hover or landing abandoned because the vehicle was silent."""
+    """Return the event for a hover or landing abandoned because the vehicle was silent."""
     text = f"the {what} was abandoned: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again once it is back"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
 
 def drift_event(drifts: bool) -> EventDraft:
-    """Return the event of a velocity that the software autopilot lacks, or has again."""
+    """Return the event for the velocity becoming unknown to the software autopilot, or known again."""
     if not drifts:
         text = "the vehicle's velocity is known again: its drift is corrected"
         return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.INFO, data={"reason": "drift", "active": False})
@@ -268,13 +268,13 @@ def drift_event(drifts: bool) -> EventDraft:
 
 
 def emergency_event(name: str) -> EventDraft:
-    """Return the event of an emergency stop by the application ``name``."""
+    """Return the event for an emergency stop by the application ``name``."""
     text = f"emergency stop by {name}"
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """Return the event of a failsafe step that began or ended."""
+    """Return the event for a failsafe step that began or ended."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
@@ -288,25 +288,25 @@ def failsafe_event(change: StepChange) -> EventDraft:
 
 
 def battery_event(low: BatteryLow) -> EventDraft:
-    """Return the event of a battery below the warning level."""
+    """Return the event for a battery below the warning level."""
     text = f"battery low: {low.battery:.0%} left"
     return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
 
 
 def taken_event(name: str, action: str, others: str) -> EventDraft:
-    """Return the event of the application ``name`` taking the vehicle; ``others``: what they did with it."""
+    """Return the event for the application ``name`` taking the vehicle; ``others``: what others did with it."""
     text = f"{name} took the vehicle by {action}: {others}"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
 
 
 def ownership_event(changed: Changed) -> EventDraft:
-    """Return the event of a flight that belongs to others, or to an earlier run."""
+    """Return the event for a flight that belongs to others, or to an earlier run."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
 
 
 def slept_event(slept_s: float) -> EventDraft:
-    """Return the event of a sleep of this computer [s]."""
+    """Return the event for a sleep of this computer [s]."""
     text = f"this computer slept for {slept_s:.1f} s: earlier commands are no longer executed"
     data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)
@@ -328,7 +328,7 @@ def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
 def authority_event(
     effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
 ) -> EventDraft:
-    """Return the event of one change of the authority; ``holder``: its holder after all changes."""
+    """Return the event for one change in authority; ``holder``: the holder after all changes."""
     name, severity = name_of(sessions, effect.app_id), Severity.WARNING
     data: dict[str, Value] = {"app_id": effect.app_id}
     if not isinstance(effect, authority.Queued | authority.Declined):

@@ -1,6 +1,6 @@
-"""Executes actions: the vehicle's own go to its driver, others to the software autopilot; also flies returns.
+"""Execute actions, by the driver if the vehicle supports them, otherwise by the software autopilot; fly returns.
 
-Not thread-safe: the command handler's lock is held around every call. Parameters and external poses bypass this module.
+Not thread-safe: the command handler's lock is held during every call. Parameters and external poses bypass this module.
 """
 
 from __future__ import annotations
@@ -52,22 +52,22 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether the path to a target must be checked: then the software autopilot flies there.
+        #: Whether the path to a target must be checked, so that the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
-        self.observe_error: Exception | None = None  #: why the driver gave none; the tick clears and raises it
+        self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears and raises it
         self._publisher = publisher
         self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
 
     @property
     def state(self) -> FlightState:
-        """The current flight state, which may be newer than the last feedback."""
+        """The current flight state, which may be more recent than the last feedback."""
         return self.flight.state(self._publisher.reported_state)
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may fly: one that never reports its state does so from its first command on."""
+        """Whether the vehicle flies, or may fly; if it never reports its state, that is from the first command on."""
         return self.flight.flies(self.state)
 
     @property
@@ -82,7 +82,7 @@ class ActionExecutor:
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
 
     def observe(self, now_ns: int) -> Changed | None:
-        """Observe the vehicle; return a change of hands of its flight, if any."""
+        """Observe the vehicle; if its flight has changed hands, return the change."""
         try:
             left_to = self._driver.left_to()
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
@@ -97,19 +97,19 @@ class ActionExecutor:
 
     @property
     def stands(self) -> bool:
-        """Whether the vehicle reports to stand on the ground, whatever the software autopilot is about to do."""
+        """Whether the vehicle reports that it is on the ground, even if the software autopilot is about to take off."""
         return self._publisher.reported_state is FlightState.LANDED
 
     def stop_autopilot(self) -> None:
-        """Stop the software autopilot because others steer."""
+        """Stop the software autopilot because others are in control."""
         if self.autopilot is not None:
             self.autopilot.stop("idle")
 
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Execute a supported action and return what was really applied. Raises the driver's errors.
+        """Execute a supported action, and return what was actually applied. Raises the driver's errors.
 
-        ``new``: a new request of an application; otherwise a repeat. Raises :class:`RefusedError` if the vehicle is
-        sure not to follow in its present state.
+        ``new``: whether it is an application's new request rather than a repeat. Raises :class:`RefusedError` if the
+        vehicle certainly won't follow in its present state.
         """
         autopilot = self.autopilot
         try:
@@ -132,7 +132,7 @@ class ActionExecutor:
         return applied
 
     def attempt(self, action: AnyAction, now_ns: int, where: str) -> bool:
-        """Apply an action that is not a new request; return whether it was accepted. Publishes failures."""
+        """Apply an action that is not a new request; return whether it was accepted. Failures are published."""
         try:
             self.execute(action, now_ns, new=False)
         except Exception as error:  # noqa: BLE001  it is reported, and the next step retries
@@ -162,9 +162,9 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover permanently: nothing is steered from here afterwards.
+        """Hover permanently: no further commands are sent.
 
-        A vehicle without a native hover is left at a standstill, as far as a single set-point can achieve that.
+        If the vehicle has no hover of its own, it is brought to a standstill as well as a single set-point can do it.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -176,7 +176,7 @@ class ActionExecutor:
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
-        """Let the software autopilot steer, if it is on; return what the driver applied."""
+        """Let the software autopilot, if it is on, send its next set-point; return what the driver applied."""
         if self.autopilot is None:
             return None
         action = self.autopilot.step(now_ns, self._shown(now_ns), self._publisher.reported_state)
@@ -199,16 +199,16 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start for the failsafe ladder, and provides the fields of feedback about it."""
+    """Flies the vehicle back to its start for the failsafe ladder, and provides the related feedback fields."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
-        self.start: Vec3 | None = None  #: where the vehicle took off, as in feedback [m]
-        self.phase = ReturnPhase.NONE  #: progress of the return, as in feedback
+        self.start: Vec3 | None = None  #: where the vehicle took off, the same as in feedback [m]
+        self.phase = ReturnPhase.NONE  #: progress of the return, the same as in feedback
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
         self._problem = ""  # why the ladder's return can't continue
-        self._good_ns = 0  # when it last went well
+        self._good_ns = 0  # when it could last continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
         """Start the ladder's return; :meth:`update` continues it."""
@@ -216,9 +216,9 @@ class ReturnSupervisor:
         self._problem, self._good_ns = "", now_ns
 
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
-        """Observe the start, and fly back if the ladder demands it; return whether feedback must change.
+        """Observe the start, and fly back if the ladder requires it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's; a vehicle flown by others is not returning for us.
+        ``ours``: whether the flight is the proxy's own; a vehicle flown by others is not returning for us.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
@@ -236,7 +236,7 @@ class ReturnSupervisor:
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't return to the start; empty if it can, or need not."""
+        """Return why the ladder can't fly back to the start; empty if it can, or need not."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem
@@ -247,10 +247,10 @@ class ReturnSupervisor:
         return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
     def _fly(self, seen: Snapshot) -> None:
-        """Take the next step of the ladder's return; objections are left to the ladder."""
+        """Take the next step of the ladder's return; the ladder handles objections."""
         now_ns = seen.now_ns
         if not seen.link_up:
-            self._good_ns = now_ns  # nothing is known, so nothing speaks against it
+            self._good_ns = now_ns  # nothing is known, so there is no objection
             return
         decision = self._checks.step_return(seen.feedback, now_ns)
         action, problem = decision.action, "" if decision.refusal is None else decision.why

@@ -1,4 +1,4 @@
-"""The command handler: applications' requests to the vehicle, under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler: executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ from skyloop.proxy.requests import Session
 from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
-_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off in progress alone; others end it
-#: Echo of a command without a new effect: refused, or held.
+_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
+#: Echo of a command without a new effect, because it was refused or held.
 _NOTHING: Final = Idle()
 
 
@@ -63,7 +63,7 @@ class CommandHandler(FlightSupervisor):
     """Handles applications' requests to one vehicle. Public methods are thread-safe."""
 
     def configure(self, settings: FlightSettings) -> None:
-        """Apply new values of the parameters. Unchanged settings are the same objects as before."""
+        """Apply new parameter values. Unchanged settings are the same objects as before."""
         with self._lock:
             airspace, space = self.checks.airspace, settings.airspace.space
             if space is not airspace.settings.space:
@@ -80,7 +80,7 @@ class CommandHandler(FlightSupervisor):
                 self._executor.autopilot.settings = settings.autopilot
 
     def aged(self, command: Command, now_ns: int) -> Command:
-        """Return a command with its true age: one from before a sleep of the computer looks as if just sent."""
+        """Return a command with its true age; after a sleep of the computer, an old command looks as if just sent."""
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -89,13 +89,13 @@ class CommandHandler(FlightSupervisor):
         return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
 
     def problem_with_ceiling(self, altitude: float) -> str:
-        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for people; empty if it may."""
+        """Return why ``limits.altitude`` must not be lowered to this height [m] now, as text; empty if it may."""
         with self._lock:
             flies = self._executor.airborne
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return why a momentary parameter, such as a flip, must not be written now, for people; empty if it may."""
+        """Return why a momentary parameter, such as a flip, must not be written now, as text; empty if it may."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
@@ -107,7 +107,7 @@ class CommandHandler(FlightSupervisor):
     # The end of a flight ----------------------------------------------------------------------------------------
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end; from now on, only landing and emergency stop are accepted.
+        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted.
 
         Returns whether the proxy has a flight, or one may be about to begin.
         """
@@ -115,12 +115,12 @@ class CommandHandler(FlightSupervisor):
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # keep withdrawing it: no one does so later
+                self._rising_until_ns = now_ns  # keep withdrawing it, because nothing does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering, as far as it can without the proxy, which is ending."""
+        """Leave a flying vehicle hovering, as well as it can without the proxy, which is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -134,12 +134,12 @@ class CommandHandler(FlightSupervisor):
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, may fly, or may be about to, and is the proxy's to land. Acquires no lock."""
+        """Whether the vehicle is, or may be, flying or about to fly, and the proxy must land it. Acquires no lock."""
         return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing flies, there is no pilot, and nothing is pending. Acquires no lock."""
+        """Whether the vehicle is not flying, there is no pilot, and nothing is pending. Acquires no lock."""
         return (
             self.authority.holder is None
             and self.ladder.idle
@@ -151,7 +151,7 @@ class CommandHandler(FlightSupervisor):
     # The authority ----------------------------------------------------------------------------------------------
 
     def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
-        """Grant the authority, or a position in the queue, or refuse it with its holder's name."""
+        """Grant the authority or a position in the queue, or refuse the request, naming the holder."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
         term_ns = None if request.for_s is None else nanoseconds(request.for_s)
@@ -161,7 +161,7 @@ class CommandHandler(FlightSupervisor):
             effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
             self._apply_authority(effects, now_ns)
             holder = authority.holder
-            assert holder is not None  # a request always leaves a holder
+            assert holder is not None  # after a request there is always a holder
             if holder.app_id == app_id:
                 return AuthorityGranted(authority.lease, authority.until_ns or 0)
             name, position = name_of(self._sessions, holder.app_id), authority.position(app_id)
@@ -173,7 +173,7 @@ class CommandHandler(FlightSupervisor):
         return Refused(Refusal.BUSY, why)
 
     def answer_takeover(self, session: Session, answer: AnswerTakeover, now_ns: int) -> AnyReply:
-        """Let the holder grant or decline a request to hand the authority over."""
+        """Handle the holder's answer to a request to hand the authority over."""
         with self._lock:
             if not self.holds(session, answer.lease):
                 return Refused(Refusal.FOREIGN_LEASE, "only the holder can answer, under its own lease")
@@ -190,7 +190,7 @@ class CommandHandler(FlightSupervisor):
         return Done()
 
     def application_left(self, session: Session, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Handle the end of a connection that is still among the sessions. ``news``: published once it hovers."""
+        """Handle the end of a connection still among the sessions. ``news``: published once the vehicle hovers."""
         with self._lock:
             self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
@@ -211,22 +211,22 @@ class CommandHandler(FlightSupervisor):
                 applied, applied_ns = self._obey(session, command, now_ns)
         self._counts["commands.received"] += 1
         if self._subscribers(COMMANDS):
-            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # limits of the echo's field
+            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # limits of that field in the echo
             action, app_id = command.action, session.app_id
             echo = Applied(command.seq, command.lease, app_id, sent_ns, applied_ns, action, applied)
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Return what was applied, and when; for a refused command, the time of receipt."""
-        # Each function call costs microseconds on a machine that was idle, as it usually was before a command. So
-        # ordinary commands are received, decided and executed here, while errors are worded elsewhere.
+        """Return what was applied and when; for a refused command, when it was received."""
+        # On a machine that was idle, as it usually was before a command, each function call costs microseconds. So
+        # ordinary commands are received, decided and executed here, while error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         if flight.whose is not Whose.OURS:
             self._observe_vehicle(now_ns)
         intents = session.intents
-        state = self._observe_intent(session, now_ns)  # an earlier end of intents must not end this one
+        state = self._observe_intent(session, now_ns)  # intents that ended earlier must not end this one
         refusal = checks.receive(command, intents, session.app_id, now_ns)
         if refusal is not None:
             if session.role is not Role.PILOT:
@@ -241,7 +241,7 @@ class CommandHandler(FlightSupervisor):
         if kind not in _LEAVE_A_TAKEOFF:
             if self._withdraw_takeoff(now_ns):
                 intent.withdrew = kind is Land
-                if kind is Hover:  # it stands, and stays there
+                if kind is Hover:  # the vehicle is on the ground and stays there
                     intent.end(Fate.COMPLETED if new else Fate.WITHDRAWN)
             state = self._executor.state
         if kind is Idle:
@@ -256,11 +256,11 @@ class CommandHandler(FlightSupervisor):
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
         automatic, fresh = command.automatic, new
-        new = new and not automatic  # the library's own actions are not a person's decision
+        new = new and not automatic  # the library's own actions don't count as a person's decision
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may bring a substitute, a hover. If the vehicle rejects it, the old set-point must still end.
+            # A refusal may come with a substitute, a hover. If the vehicle rejects that, the old one must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -271,7 +271,7 @@ class CommandHandler(FlightSupervisor):
                 if decision.clamps:
                     self._counts["commands.clamped"] += 1
             try:
-                begins = new or (fresh and decision.takes_off)  # also a take-off that a waiting call repeats
+                begins = new or (fresh and decision.takes_off)  # this includes a take-off repeated by a waiting call
                 applied = self._executor.execute(decision.action, now_ns, new=begins)
             except RefusedError as error:
                 self._stop_before(kind, now_ns)
@@ -289,7 +289,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # Before feedback shows this intent: an "arrived" beside it would be the previous return's.
+        # This precedes the intent in feedback, where an "arrived" would still be that of the previous return.
         if fresh and self._returns.observe():
             self._stamp()
         self._report_intent(session)
@@ -300,7 +300,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after an application's new command, or if the flight is not others'."""
+        """Make the flight ours after a new command by an application, or if no others are flying the vehicle."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -312,14 +312,14 @@ class CommandHandler(FlightSupervisor):
             self.on_ownership(True)
 
     def _stop_before(self, kind: type[Action], now_ns: int) -> None:
-        """Hover after a refused set-point, as soon as the driver accepts: the previous set-point must not continue."""
+        """Hover after a refused set-point, once the driver accepts it, so that the previous one does not continue."""
         moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
         if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
             self.ladder.hand_over(now_ns)
             self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Execute any pilot's emergency stop: without a lease, however old or out of sequence."""
+        """Execute any pilot's emergency stop, even without a lease, and however old or out of sequence."""
         intents, holds = session.intents, self.holds(session, command.lease)
         refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
         intents.stop(command)
@@ -334,7 +334,7 @@ class CommandHandler(FlightSupervisor):
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent then
+            self.authority.last_command_ns = now_ns  # a stop's repeats count as a sign of life: nothing else is sent
         self._rising_until_ns = None  # only the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None
@@ -363,7 +363,7 @@ class CommandHandler(FlightSupervisor):
     def _refuse_intent(
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
-        """Refuse the holder's intent and end it: its repeats get the same answer."""
+        """Refuse the holder's intent and end it, so that its repeats get the same answer."""
         intent.refuse(reason, why)
         self._report_intent(session)
         kind, seen = type(command.action), self._executor.seen(now_ns)

@@ -1,7 +1,7 @@
-"""The parameters of a proxy and of its driver in one typed store, and the answers to requests about them.
+"""Keep the parameters of a proxy and its driver in one typed store, and answer requests about them.
 
-Checking is pure (:func:`check`). If proxy and driver have a parameter of the same name, the driver's is shown and
-written, and the proxy obeys its value: for example ``limits.tilt`` of a vehicle with its own limit.
+Checking is pure (:func:`check`). If proxy and driver have a parameter with the same name, the driver's is shown and
+written, and the proxy obeys its value. An example is ``limits.tilt`` for a vehicle with a limit of its own.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.requests import Session
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written
 
-MAX_TEXT: Final = 1024  #: characters of a text value
-MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: larger ones of a driver are left out
-PAGE_BYTES: Final = MAX_BODY - 256  #: bytes of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or never: its writer waits no longer than that.
+MAX_TEXT: Final = 1024  #: characters in a text value
+MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
+PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one reply
+#: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -52,7 +52,7 @@ _encoded = msgspec.msgpack.Encoder().encode
 
 
 def described(driver: Driver) -> list[Parameter]:
-    """Return a driver's parameters, with its findings as one more. Raises the driver's errors."""
+    """Return a driver's parameters, plus one that holds its findings. Raises the driver's errors."""
     parameters = list(driver.parameters())
     try:
         diagnostics = driver.checkup()
@@ -132,7 +132,7 @@ OWN: Final[tuple[Parameter, ...]] = (
 
 
 def check(parameter: Parameter, value: Value) -> Value:
-    """Return the value to write: of the parameter's type, finite, within its range and choices.
+    """Return the value to write, checked for type, finiteness, range and choices.
 
     An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError` that names the
     allowed values, with the :class:`Refusal` as its code.
@@ -219,17 +219,17 @@ class Parameters:
         self._lock = threading.Lock()
         self._own = {parameter.name: parameter for parameter in OWN}
         self._driver: dict[str, Parameter] = {}
-        self._presets: dict[str, Value] = {}  # not yet written to the driver
-        self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to send
+        self._presets: dict[str, Value] = {}  # presets not yet written to the driver
+        self.left_out: tuple[str, ...] = ()  #: names of the driver's parameters that are too large to send
         self._in_force: dict[str, Any] = {}  # values of the proxy's own parameters
-        self._changed: set[str] = set()  # first parts of names that the settings do not reflect yet
+        self._changed: set[str] = set()  # first parts of the names of parameters that the settings don't reflect yet
         self._settings = FlightSettings()
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Set values of the proxy's own parameters before it starts.
+        """Set values for the proxy's own parameters before it starts.
 
-        If the vehicle has a parameter of the same name, :meth:`write_presets` writes that.
+        If the vehicle has a parameter with the same name, :meth:`write_presets` writes to it.
 
         Raises :class:`UnknownNameError` and :class:`ParameterError`.
         """
@@ -240,7 +240,7 @@ class Parameters:
             self._apply(OWN)
 
     def write_presets(self) -> list[tuple[str, str]]:
-        """Write presets to the vehicle's parameters; return the failures with reasons."""
+        """Write presets to the vehicle's parameters; return which ones failed, with reasons."""
         problems = []
         for name in [name for name in self._presets if name in self._driver]:
             try:
@@ -261,7 +261,7 @@ class Parameters:
             self._apply(OWN)
 
     def get(self, name: str) -> Parameter:
-        """Return one parameter as last known. Raises :class:`UnknownNameError`."""
+        """Return the last known state of a parameter. Raises :class:`UnknownNameError`."""
         with self._lock:
             parameter = self._driver.get(name) or self._own.get(name)
             if parameter is None:
@@ -269,12 +269,12 @@ class Parameters:
             return parameter
 
     def number(self, name: str) -> float:
-        """Return the effective value of one of the proxy's own parameters: the driver's if it has it, too."""
+        """Return the effective value of one of the proxy's own parameters: the driver's, if the driver has it, too."""
         value: float = self._in_force[name]
         return value
 
     def _apply(self, parameters: Iterable[Parameter]) -> None:
-        """Apply values of the proxy's own parameters, and note which changed. The lock is held."""
+        """Apply values of the proxy's own parameters, and record which have changed. The lock is held."""
         for standard in parameters:
             name, kind = standard.name, standard.type
             own = self._own[name].value
@@ -283,14 +283,14 @@ class Parameters:
                 value = value if isinstance(value, str) else ""
             elif kind is ParameterType.BOOL:
                 value = value if isinstance(value, bool) else own
-            else:  # the driver uses the name for something else: the proxy keeps its own value
+            else:  # the driver uses the name for something else, so the proxy keeps its own value
                 value = float(value) if isinstance(value, int | float) and math.isfinite(value) else own
             if self._in_force.get(name) != value:
                 self._in_force[name] = value
                 self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return the flight settings from the effective values.
+        """Return the flight settings that follow from the effective values.
 
         Raises :class:`ParameterError` if the driver's no-fly zones can't be parsed.
         """
@@ -300,7 +300,7 @@ class Parameters:
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return its new state; ``known``: as just returned by :meth:`get`.
+        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`.
 
         Raises :class:`UnknownNameError`, :class:`ParameterError`, and the driver's errors.
         """
@@ -320,7 +320,7 @@ class Parameters:
         return written
 
     def page(self, first: int) -> ParameterPage:
-        """Return as many parameters, sorted by name, from ``first`` on, as fit into one reply."""
+        """Return as many parameters as fit into one reply, sorted by name, starting at index ``first``."""
         with self._lock:
             everything = sorted({**self._own, **self._driver}.values(), key=lambda parameter: parameter.name)
         chosen: list[Parameter] = []
@@ -334,10 +334,10 @@ class Parameters:
 
 
 class ParameterRequests:
-    """Answers applications' requests about parameters, and applies their values. May wait for the vehicle.
+    """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. They also change without being written: each is
-    always read again, and a change causes no event.
+    ``free``: parameters that any pilot may write without the authority. As they also change without being written, each
+    is always read again, and changes cause no event.
     """
 
     def __init__(
@@ -357,7 +357,7 @@ class ParameterRequests:
         self._clock = clock
 
     def read_driver(self) -> None:
-        """Read the driver's parameters; if it raises, keep the old ones."""
+        """Read the driver's parameters; keep the old ones if it raises."""
         try:
             self._parameters.refresh()
         except Exception as error:  # noqa: BLE001  it is reported, and the flight continues
@@ -367,24 +367,24 @@ class ParameterRequests:
             text = f"parameters too large to send: {names}"
             self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING)
         for name, why in self._parameters.write_presets():
-            if self._publisher.link_up:  # without a link it can't write: retried once the link is up
+            if self._publisher.link_up:  # without a link it can't write them, and will retry once the link is up
                 text = f"{name} could not be preset: {why}"
                 self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="preset")
         self._handler.configure(self._parameters.flight_settings())
 
     def get(self, _session: Session, request: GetParameter, _now_ns: int) -> AnyReply:
-        """Answer with one parameter as last known. Raises :class:`UnknownNameError`."""
+        """Answer with the last known state of one parameter. Raises :class:`UnknownNameError`."""
         if request.name in self._free:
             self.read_driver()
         return ParameterValue(self._parameters.get(request.name))
 
     def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
-        """Read the driver's parameters again and answer with a page of all."""
+        """Read the driver's parameters again, and answer with a page of all parameters."""
         self.read_driver()
         return self._parameters.page(request.first)
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
-        """Write one for the holder of the authority. Raises the errors of :meth:`Parameters.set`."""
+        """Write a parameter for the holder of the authority. Raises the errors of :meth:`Parameters.set`."""
         name, value = request.name, request.value
         waited_ns, known = self._clock() - now_ns, self._parameters.get(name)
         if known.momentary and waited_ns > MOMENT_NS:

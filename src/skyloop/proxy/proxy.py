@@ -1,8 +1,8 @@
 """The proxy: makes one vehicle's driver a node that any number of applications observe and one at a time flies.
 
-Threads: the transport's execute commands and pass on poses, the driver's publish, a ticker (50 Hz) updates authority,
-    failsafe and autopilot, and one more answers requests. Flying calls of the driver, also in ``end``, hold the
-    handler's lock.
+Threads: those of the transport execute commands and pass on poses, those of the driver publish, a ticker (50 Hz)
+    updates authority, failsafe and autopilot, and one more answers requests. The handler's lock is held whenever the
+    driver is called to fly, including in ``end``.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ from skyloop.proxy.requests import HELLO_NS, MAX_MALFORMED, JobQueue, RequestDis
 from skyloop.proxy.topics import OverviewPublisher
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_NAME: Final = 64  #: characters of a proxy's name
+MAX_NAME: Final = 64  #: characters in a proxy's name
 
 _POLL_S: Final = 0.2
-_ABANDON_S: Final = 1.0  #: how long ending a proxy with a hanging driver waits for its other parts
+_ABANDON_S: Final = 1.0  #: how long ending a proxy waits for its other parts if the driver hangs
 _log = logging.getLogger(__name__)
 
 
@@ -81,10 +81,10 @@ class Proxy:
         driver: The vehicle's driver, not yet open.
         server_end: The end that applications connect to, not yet started.
         name: The name that applications connect to, 1 to 64 characters.
-        clock: The clock of all its samples [ns].
-        ticker: False leaves :meth:`tick` to the caller: for many proxies in a process, tests, and simulated time.
+        clock: The clock for all its samples [ns].
+        ticker: If False, the caller calls :meth:`tick`, as for many proxies in a process, tests, or simulated time.
         jobs: Answers requests that may wait for the vehicle; by default on a separate thread.
-        slept: Returns how long the computer has slept in total [ns]; by default the system's, with its clock.
+        slept: Returns how long the computer has slept in total [ns]; by default the system's, if the clock is.
 
     Raises:
         UsageError: The name is empty or too long.
@@ -107,7 +107,7 @@ class Proxy:
         self.driver = driver
         self.server = server_end
         self.clock = clock
-        self.run_id = secrets.randbits(63)  #: differs in each run
+        self.run_id = secrets.randbits(63)  #: different in each run
         self.capabilities = driver.capabilities()
         software = software_actions(self.capabilities.actions)
         if software != self.capabilities.software:
@@ -128,7 +128,7 @@ class Proxy:
             clock=clock,
             capabilities=self.capabilities,
             state_of=flight.state,
-            # Read its parameters again, now that the vehicle answers.
+            # Read the driver's parameters again now that the vehicle answers.
             on_link_up=lambda: self._requests.call_later(self._parameter_requests.read_driver),
             scrub=driver.uri.scrub,
         )
@@ -183,19 +183,19 @@ class Proxy:
         self._command, self._aged = self.handler.command, self.handler.aged
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write an audit trail, which is closed with the proxy. Call before :meth:`start`."""
+        """Write an audit trail; it is closed when the proxy ends. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
 
     def keep_record(self, record: FlightRecord) -> None:
-        """Keep a note of the proxy's flight in this file, and end a flight noted there. Call before :meth:`start`."""
+        """Record the proxy's flight in this file, and end a flight recorded there. Call before :meth:`start`."""
         self._record = record
         self.handler.on_ownership = record.set
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start to serve. Raises the errors of opening transport and driver, after stopping again."""
+        """Start serving. If the transport or the driver can't be opened, stop again and raise the error."""
         with self._life_lock:
             if self._started:
                 raise UsageError(f"proxy {self.name} was started before: create another one")
@@ -238,26 +238,26 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight and then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
+        """End the flight, then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
 
-        First, everything except landing and emergency stop is barred for good, whether or not the vehicle flies. Then a
-        flying vehicle is landed. If it has not landed in time, it is left hovering if it can hover without
-        the proxy; otherwise it gets one last set-point of zero speed.
+        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle flies.
+        Then a flying vehicle is landed. If it does not land in time, it is left hovering if it can hover without
+        the proxy; otherwise it gets a final set-point of zero speed.
 
         Args:
             within_s: Time limit for the landing [s]; 0: don't land.
-            reason: The reason, for people.
+            reason: The reason, as readable text.
             hurry: Called several times a second; True ends the wait for the landing. A vehicle that can't hover
-                without the proxy is still landed, however long it takes: without its proxy it would fall.
-            unless_flying: If it has not landed in time, the landing continues, and so does the proxy.
-            hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or hover: calls
-                that may hang are left to daemon threads, as if the proxy had been killed.
+                without the proxy is still landed, however long it takes, because otherwise it would fall.
+            unless_flying: If the vehicle does not land in time, the landing continues, and so does the proxy.
+            hangs: Whether the driver hangs or fails. If so, nothing waits for it, and it is not asked to land or hover:
+                calls that may hang are left to daemon threads, as if the proxy had been killed.
 
         Returns:
-            Whether no flight of the proxy remains.
+            True if no flight of the proxy remains.
 
         Raises:
-            Exception: The error of a step, after all are done. If the driver hangs, it goes to the log.
+            Exception: The error of a step, once all steps are done. If the driver hangs, errors are logged instead.
         """
         if not self._started or self.ended:
             return True
@@ -274,14 +274,14 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # from last to first, each one whatever the others raise
+        with ExitStack() as steps:  # these run from last to first, even if others raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
             steps.callback(self._abandon if hangs else self._close)
             steps.callback(self.overview.end)
             steps.callback(self.events.publish, EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-            if not hangs:  # first of all, stop obeying and steering
+            if not hangs:  # this runs first: stop obeying and steering
                 steps.callback(lambda: self.handler.leave_hovering(self.clock()))
                 if self._ticker is not None and self._ticker.is_alive():
                     self._ticker.join()
@@ -299,7 +299,7 @@ class Proxy:
         return not handler.airborne
 
     def _close(self) -> None:
-        with ExitStack() as steps:  # from last to first
+        with ExitStack() as steps:  # these run from last to first
             steps.callback(self.server.stop)
             steps.callback(self.publisher.streams.end)
             steps.callback(self.driver.close)
@@ -342,7 +342,7 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, which has no name and no role until its Hello."""
+        """Handle a new connection, whose name and role are unknown until its Hello."""
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
@@ -375,7 +375,7 @@ class Proxy:
             self._malformed(session, f"{kind.__name__} may only be sent by the proxy", now_ns)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Count and report a packet that the sender's keys do not allow, or whose sender is not connected."""
+        """Count and report a packet not allowed by the sender's keys, or whose sender is not connected."""
         session = self._sessions.get(peer.id)
         name = None if session is None else session.name
         code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
@@ -410,7 +410,7 @@ class Proxy:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
-        if self._stopping.is_set():  # everyone leaves, and the driver may already be closed
+        if self._stopping.is_set():  # all applications are leaving, and the driver may be closed already
             self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
@@ -418,7 +418,7 @@ class Proxy:
         del self._sessions[peer.id]
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
-        """Count a packet as malformed if there is a reason, and end a connection that sends too many."""
+        """Count a packet as malformed if a reason is given, and end a connection that sends too many."""
         if not reason:
             return
         self._counts["packets.malformed"] += 1
@@ -439,8 +439,8 @@ class Proxy:
     # Time ------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Update all that depends on time: authority, failsafe, autopilot, feedback of a silent vehicle, events."""
-        if self._stopping.is_set():  # a shared ticker, or one back from a hang, may tick after the end
+        """Update everything that depends on time: authority, failsafe, autopilot, feedback while silent, events."""
+        if self._stopping.is_set():  # a shared ticker, or one that was hanging, may tick after the end
             return
         self.tick_flight(now_ns)
         self._end_silent(now_ns)
@@ -457,11 +457,11 @@ class Proxy:
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing flies, there is no pilot, and feedback shows both, so that nothing is urgent."""
+        """Whether the vehicle is not flying, there is no pilot, and feedback shows both, so that nothing is urgent."""
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
-        """End connections without a Hello, because they occupy places."""
+        """End connections that have sent no Hello, because they take up places."""
         for session in list(self._sessions.values()):
             if session.role is None and not session.ended and now_ns - session.joined_ns > HELLO_NS:
                 session.ended = True
@@ -498,7 +498,7 @@ class Proxy:
         return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
 
     def statistics(self) -> dict[str, float]:
-        """Return all counters by dotted name, as for ``GetStatistics``. Thread-safe."""
+        """Return all counters by dotted name, the same as for ``GetStatistics``. Thread-safe."""
         return self._counters.snapshot(applications=self.applications, **self.server.counters)
 
     @property

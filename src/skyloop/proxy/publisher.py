@@ -1,4 +1,4 @@
-"""Publishes the driver's reports (feedback, frames, streams, link state, events) on the driver's thread."""
+"""Publish the driver's reports (feedback, frames, streams, link state, events) on the driver's thread."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2"
 class VehiclePublisher:
     """The driver's :class:`skyloop.drivers.base.Sink`, and the newest known state of the vehicle.
 
-    It acquires no lock that is held during calls of the driver, so a driver may call it on any thread, also
+    It acquires no lock that is held while the driver is called, so a driver may call it on any thread, even
     re-entrantly.
 
-    ``state_of``: returns the flight state for the one that the driver reported, because the software autopilot may know
-    better. ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the
-    secrets of the vehicle's address from a text.
+    ``state_of``: returns the flight state, given the driver's, because the software autopilot may know better.
+    ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the secrets in
+    the vehicle's address from a text.
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class VehiclePublisher:
         on_link_up: Callable[[], None],
         scrub: Callable[[str], str] = str,
     ) -> None:
-        self.feedback_now: Feedback | None = None  #: the newest sample as published
-        self.reported_state = FlightState.UNKNOWN  #: the driver's state, before the software autopilot
+        self.feedback_now: Feedback | None = None  #: the newest sample, as it was published
+        self.reported_state = FlightState.UNKNOWN  #: the state reported by the driver, without the software autopilot
         self.link_state = LinkState.CONNECTING
-        self.link_reason = ""  #: the expected event, and the last failure
-        self.link_remedy = ""  #: a remedy for people
+        self.link_reason = ""  #: what is being waited for, and the last failure
+        self.link_remedy = ""  #: what a person can do about it
         self.link_up = False
-        self.link_breaks = 0  #: how often the link went down or came back
+        self.link_breaks = 0  #: number of times the link went down or came back
         self.state_of = state_of
         self.variants = FeedbackVariants(server, counters, clock)
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
@@ -94,7 +94,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # the same as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -125,7 +125,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def _finite(self, raw: Feedback) -> Feedback:
-        """Return feedback in which NaN and infinite numbers are unknown, so that no reader must handle them."""
+        """Return feedback with NaN and infinite numbers replaced by unknown, so that readers need not handle them."""
         vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
         total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
         total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
@@ -141,19 +141,19 @@ class VehiclePublisher:
         return _replace(raw, **dict.fromkeys(wrong))
 
     def stamp(self, owner: dict[str, Any]) -> None:
-        """Set the proxy's own fields of feedback; they show by the next tick."""
+        """Set the proxy's own fields in feedback; they are published by the next tick."""
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Set the outcome of an intent in feedback; an end shows by the next tick."""
+        """Set the outcome of an intent in feedback; if it has ended, that is published by the next tick."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
     def is_shown(self) -> bool:
-        """Whether feedback shows the current fields of the proxy and the link."""
+        """Whether feedback shows the current state of the proxy and the link."""
         return self._published_ns >= 0
 
     def keep_alive(self, now_ns: int) -> None:
@@ -166,7 +166,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def wait_for(self, wanted: Callable[[FlightState], bool], timeout_s: float) -> bool:
-        """Block until the flight state meets a condition; return False after the time-out. Not for drivers' threads."""
+        """Block until the flight state meets a condition; return False after the time-out. Not on drivers' threads."""
         with self._publishing:
             return self._publishing.wait_for(lambda: wanted(self._state), timeout_s)
 
@@ -215,7 +215,7 @@ class VehiclePublisher:
         )
 
     def overview(self, name: str, uri: str, event: Event | None, *, applications: int) -> VehicleOverview:
-        """Return the vehicle's row in the overview; ``event``: the newest one."""
+        """Return the vehicle's row in the overview; ``event``: the newest event."""
         known = self.feedback_now or Feedback(captured_ns=0)
         return VehicleOverview(
             name=name,
@@ -282,7 +282,7 @@ class VehiclePublisher:
             self.streams.frame(header, pixels)
 
     def cameras(self) -> Collection[str]:
-        """Return the names of the vehicle's cameras, and of undeclared ones with frames. Thread-safe."""
+        """Return the names of the vehicle's cameras, including undeclared ones that sent frames. Thread-safe."""
         return {*self._cameras, *self._frame_seq.copy()}
 
     def topic_problem(self, topic: str) -> str:
@@ -297,11 +297,11 @@ class VehiclePublisher:
         return self.streams.problem(topic, request, info)
 
     def wants(self, camera: str) -> bool:
-        """Return whether anyone uses this camera's frames at present."""
+        """Return whether this camera's frames are in use at present."""
         return self.wanted_fps(camera) > 0.0
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames per second are used: infinity for all, 0 for none."""
+        """Return how many of this camera's frames are used per second: infinity for all, 0 for none."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
@@ -320,7 +320,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as the vehicle encoded it."""
+        """Publish a picture as encoded by the vehicle."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -338,7 +338,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether anyone receives this camera's encoded pictures."""
+        """Return whether this camera's encoded pictures have receivers."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
@@ -350,16 +350,16 @@ class VehiclePublisher:
     # Link and events -------------------------------------------------------------------------------------------
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Publish a change of the vehicle link at once; the flight acts on it at its next step."""
+        """Publish a change of the vehicle link at once; the flight reacts at its next step."""
         reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
             before, self.link_state = self.link_state, state
             self.link_reason, self.link_remedy = reason, remedy
             was_up, self.link_up = self.link_up, state in _LINK_UP
-            if was_up != self.link_up and (was_up or self.link_breaks):  # not when it comes up for the first time
+            if was_up != self.link_up and (was_up or self.link_breaks):  # except when it comes up for the first time
                 self.link_breaks += 1
-            self._published_ns = -KEEP_ALIVE_NS  # shown in feedback at the next tick
+            self._published_ns = -KEEP_ALIVE_NS  # published in feedback at the next tick
         if same:
             return
         change = state.value if before is state else f"{before.value} → {state.value}"
@@ -369,24 +369,24 @@ class VehiclePublisher:
         self._events.publish(EventKind.VEHICLE_LINK, text, severity, data=data)
         if before is state:
             return
-        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known now: read it again
+        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known now, so read it again
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Publish a driver's event; repeated driver errors once a second."""
+        """Publish an event from the driver; repeated driver errors are published once a second."""
         if kind is EventKind.DRIVER_ERROR:
             self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
         else:
             self._events.publish(kind, text, severity, data=data)
 
     def driver_failed(self, where: str, error: BaseException) -> str:
-        """Report a failed call of the driver; return the text for the requester."""
+        """Report that a call of the driver failed; return the text for the requester."""
         self._counts["driver.errors"] += 1
         self._fail(where, f"driver failed in {where}: {error!r}")
         return self._scrub(f"the driver failed: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
-        """Return the text for the sender of a command that made the driver raise; publish unexpected errors, too."""
+        """Return the text for the sender of a command that made the driver raise; also publish unexpected errors."""
         if isinstance(error, SkyloopError):  # the vehicle's own reason
             self._counts["driver.errors"] += 1
             return self._scrub(str(error))

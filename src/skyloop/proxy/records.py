@@ -1,11 +1,11 @@
-"""Files that a proxy writes, each in its own thread: the audit trail, and the note of its flight.
+"""Write a proxy's files, each in its own thread: the audit trail, and the note about its flight.
 
-The audit trail records who flew when, one JSON object per line, append-only. ``docs/sharing.md`` describes it.
+The audit trail records who flew when, as one JSON object per line, append-only. ``docs/sharing.md`` describes it.
 :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
-The note records that a flight is this proxy's, so that a proxy that was killed ends its own flight after its restart.
-It is written when a flight becomes the proxy's, refreshed while it lasts, and removed when it is over, belongs to
-others, or can no longer turn up. It is valid for :data:`LIFE_S`: after that, others may have taken off.
+The note records that a flight is this proxy's, so that after being killed and restarted, a proxy ends its own flight.
+It is written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over,
+belongs to others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
 _MODE: Final = 0o600
 
-#: How long a note is valid: a supervisor restarts a proxy within seconds, before anyone changes the pilot.
+#: How long a note is valid; supervisors restart a proxy within seconds, before another pilot takes over.
 LIFE_S: Final = seconds(BELIEF_NS)
-KEEP_S: Final = 2.0  #: how often it is refreshed
-MAX_BYTES: Final = 4096  #: of an address; a longer file is not ours
+KEEP_S: Final = 2.0  #: how often the note is refreshed
+MAX_BYTES: Final = 4096  #: maximum length of an address; a longer file is not ours
 NOTE_SUFFIX: Final = ".flight"
 
 _log = logging.getLogger(__name__)
@@ -46,25 +46,25 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
-    run: str  #: of the proxy, at random
+    run: str  #: random identity of the proxy's run
     what: str  #: ``begin``, ``granted``, ``ended``, ``takeoff``, ``landed``, ``emergency`` or ``end``
     who: str = ""  #: name of the application
-    identity: str = ""  #: the transport's information: process and user, or a certificate's name
+    identity: str = ""  #: what the transport knows: process and user, or the name in a certificate
     lease: int = 0
     priority: int = 0
     how: str = ""  #: why a lease, or the run, ended; in ``begin``, the vehicle's address
 
 
 class Tenure(msgspec.Struct, frozen=True):
-    """The time from a grant to its end."""
+    """The time during which an application held the authority, from a grant to its end."""
 
     proxy: str
     who: str
     identity: str
     priority: int
     begin: datetime
-    end: datetime | None  #: None: it continues, or the proxy was killed
-    how: str  #: why it ended; empty: not ended, as far as the file shows
+    end: datetime | None  #: None if it continues, or if the proxy was killed
+    how: str  #: why it ended; empty if, according to the file, it has not ended
     takeoffs: int = 0
 
 
@@ -101,7 +101,7 @@ def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
 
 
 def tenures(entries: Iterable[Entry]) -> list[Tenure]:
-    """Return the times of authority in order of the grants; entries of several proxies may be mixed."""
+    """Return all tenures in order of the grants; entries of several proxies may be mixed."""
     done: list[Tenure] = []
     held: dict[str, int] = {}
     for entry in entries:
@@ -123,7 +123,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """Read the entries of a file; return them and the number of unreadable lines (for example, cut by a crash).
+    """Read a file; return its entries and the number of unreadable lines (for example, cut off by a crash).
 
     Raises :class:`UsageError` for an unreadable file.
     """
@@ -153,7 +153,7 @@ def audit_path(name: str) -> Path:
 
 
 class AuditTrail:
-    """Writes the lines of one proxy's run in its own thread, so that :meth:`note` never waits for the disk."""
+    """Writes the lines about one run of a proxy in its own thread, so that :meth:`note` never waits for the disk."""
 
     def __init__(self, path: Path, proxy: str, run: str, wall: Callable[[], datetime] | None = None) -> None:
         """Open the file. Raises ``OSError``."""
@@ -169,11 +169,11 @@ class AuditTrail:
         self._thread.start()
 
     def begin(self, uri: str) -> None:
-        """Note the start of the proxy's run."""
+        """Record the start of the proxy's run."""
         self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:
-        """Note an event. Thread-safe."""
+        """Record an event. Thread-safe."""
         entry = entry_of(event, self._wall(), self._proxy, self._run)
         if entry is not None:
             self._queue.put(entry)
@@ -192,7 +192,7 @@ class AuditTrail:
 
     def _write(self, line: bytes) -> None:
         try:
-            os.write(self._file, line)  # one call, so that lines of several writers do not mix
+            os.write(self._file, line)  # a single call, so that the lines of several writers do not mix
             self._failed = False
         except OSError as error:
             if not self._failed:  # a full disk is logged once, and the flight continues
@@ -204,7 +204,7 @@ class AuditTrail:
 
 
 def record_path(name: str) -> Path:
-    """Return the file of a proxy: beside its socket, where only its user may write."""
+    """Return a proxy's file, which is next to its socket, where only its user may write."""
     from skyloop.transport.local.directory import find_directory
 
     return find_directory().path / (name + NOTE_SUFFIX)
@@ -213,14 +213,14 @@ def record_path(name: str) -> Path:
 class FlightRecord:
     """The file of one proxy, written in its own thread from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: its address, because a note about another vehicle does not count; ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address, as notes about other vehicles are ignored; ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:
         self.path = path
         self._vehicle = vehicle
         self._wall = wall
-        self._ours: bool | None = None  # unknown yet: the note stays unchanged
+        self._ours: bool | None = None  # None while unknown: the note stays unchanged
         self._written = False
         self._failed = False
         self._closing = False
@@ -228,7 +228,7 @@ class FlightRecord:
         self._thread: threading.Thread | None = None
 
     def left_s(self) -> float:
-        """Return how long the flight of an earlier run may still turn up [s]; 0: there is none.
+        """Return for how much longer the flight of an earlier run may turn up [s]; 0 if there is none.
 
         Call before :meth:`start`.
         """
@@ -242,7 +242,7 @@ class FlightRecord:
         return LIFE_S - max(0.0, age_s) if believed else 0.0
 
     def start(self) -> None:
-        """Start to write."""
+        """Start writing."""
         self._thread = threading.Thread(target=self._run, name="skyloop-flight-record", daemon=True)
         self._thread.start()
 
@@ -253,19 +253,19 @@ class FlightRecord:
             self._changed.set()
 
     def close(self) -> None:
-        """Write the last state. A vehicle left in the air stays noted, so that the next run can end its flight."""
+        """Write the final state. The note stays if the vehicle is left in the air, for the next run to end this."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._closing = True
             self._changed.set()
-            thread.join(CLOSE_S)  # a file system may hang, but not the end of the proxy
+            thread.join(CLOSE_S)  # a file system may hang, but the end of the proxy must not
 
     def _run(self) -> None:
         closing = False
         while not closing:
             self._changed.wait(KEEP_S if self._ours else None)
             self._changed.clear()
-            closing = self._closing  # read before the state, so that a change during the write is written, too
+            closing = self._closing  # read before the state, so that a change during the write is not missed
             try:
                 self._write()
             except OSError as error:

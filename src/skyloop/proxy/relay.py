@@ -1,6 +1,6 @@
-"""Relays what applications send to others: annotations, logs and results to subscribers, poses to the driver.
+"""Relay what applications send: annotations, logs and results to subscribers, and poses to the driver.
 
-Results come from processors' workers: :class:`WorkerRoster`, which is pure, assigns the frames;
+Results come from the workers of processors: :class:`WorkerRoster`, which is pure, assigns frames to them;
 :class:`ProcessorWorkers` sends each worker its share and relays its results.
 """
 
@@ -39,14 +39,14 @@ from skyloop.proxy.requests import Session
 from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
-MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
-#: A worker silent for this long loses its share: it hangs, or its host does.
+MAX_ANNOTATION: Final = 32_768  #: bytes in an annotation's packet
+#: A worker that is silent for this long loses its share, because it or its host hangs.
 SILENT_S: Final = 1.0
-#: How far in the future a result's frame may be: the error of its camera's clock.
+#: How far in the future a result's frame may be, because of errors in its camera's clock.
 MAX_AHEAD_S: Final = 1.0
-MAX_JOINED: Final = 8  #: processors that one application may work for
+MAX_JOINED: Final = 8  #: maximum number of processors that one application may work for
 
-_Key = tuple[int, str]  # application, processor
+_Key = tuple[int, str]  # number of the application, name of the processor
 
 
 class Relay:
@@ -67,7 +67,7 @@ class Relay:
         self._counts = counters.counts
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
-        """Relay an annotation to its subscribers; return why it is malformed, empty if it is not."""
+        """Relay an annotation to its subscribers; return why it is malformed, or an empty text."""
         unknown = camera_problem(annotation.camera, self._cameras)
         if unknown:
             return f"an annotation of an unknown frame: {unknown}"
@@ -76,7 +76,7 @@ class Relay:
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Relay a log entry to its subscribers; return why it is malformed, empty if it is not."""
+        """Relay a log entry to its subscribers; return why it is malformed, or an empty text."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:
@@ -87,7 +87,7 @@ class Relay:
         return ""
 
     def pose(self, session: Session, pose: VehiclePose) -> None:
-        """Pass a pose of the vehicle to its driver. Refusals are published at most once a second."""
+        """Pass the vehicle's pose to its driver. Refusals are published at most once a second."""
         if session.role is not Role.PILOT:
             self._refuse_pose(session, Refusal.OBSERVER, "observers can't send poses: connect as a pilot")
             return
@@ -140,7 +140,7 @@ class ProcessorWorkers:
         self._sent: dict[_Key, ProcessorShare] = {}
 
     def join(self, session: Session, asked: JoinProcessor, now_ns: int) -> AnyReply:
-        """Make the application a worker, or keep it as one, and send it its share."""
+        """Make the application a worker, or renew it as one, and send it its share."""
         app_id = session.app_id
         with self._lock:
             before = self._roster.find(app_id, asked.processor)
@@ -149,7 +149,7 @@ class ProcessorWorkers:
                 return refused
             self._sessions[app_id] = session
             self._roster.register(app_id, asked, now_ns)
-            self._sent.pop((app_id, asked.processor), None)  # resent each time: the last one may have been lost
+            self._sent.pop((app_id, asked.processor), None)  # sent each time, because the last one may have been lost
             self._send_shares()
         if before is None:
             self._publish_change(session, asked, "joined", f"works for processor {asked.processor}")
@@ -181,9 +181,9 @@ class ProcessorWorkers:
             self._publish_change(session, asked, "silent", text)
 
     def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
-        """Relay a result to its subscribers, under the number of the sending application.
+        """Relay a result to its subscribers, marked with the number of the sending application.
 
-        Returns why it is malformed, empty if it is not. A refused one is published as an event and counted.
+        Returns why it is malformed, or an empty text. A refused result is counted, and published as an event.
         """
         if session.role is None:
             return "a result arrived before Hello"
@@ -194,7 +194,7 @@ class ProcessorWorkers:
             why = f"it is not a worker of processor {result.processor}"
         elif result.camera != worker.asked.camera:
             why = f"it works for {result.processor} on frames of {worker.asked.camera}, not of {result.camera}"
-        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all later ones would be older
+        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all later results would count as older
             why = f"its frame's capture time is {seconds(result.captured_ns - now_ns):.1f} s in the future"
         if why:
             self._counts["results.refused"] += 1
@@ -250,7 +250,7 @@ class ProcessorWorkers:
 
 @dataclass(slots=True)
 class Worker:
-    """One application as a worker of one processor."""
+    """One application in its role as a worker of one processor."""
 
     asked: JoinProcessor
     received_ns: int
@@ -262,17 +262,17 @@ class Worker:
 
 
 class WorkerRoster:
-    """The workers of all processors, by application and name of the processor."""
+    """The workers of all processors, by application and processor name."""
 
     def __init__(self) -> None:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """Return this application as a worker of that processor; None if it is not."""
+        """Return the worker that this application is for that processor, if it is one."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        """Add a worker, or renew it."""
+        """Add or renew a worker."""
         self._workers[app_id, asked.processor] = Worker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:
@@ -285,7 +285,7 @@ class WorkerRoster:
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
-        """Return another worker under that name that conflicts with this one."""
+        """Return another worker with that name that conflicts with this one, if any."""
         for (app, name), worker in self._workers.items():
             other = worker.asked
             alike = (other.code, other.shared) == (asked.code, asked.shared)
@@ -294,7 +294,7 @@ class WorkerRoster:
         return None
 
     def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
-        """Mark and return workers that have been silent for too long and were not marked yet."""
+        """Mark workers that have been silent for too long; return those that were not marked before."""
         found = []
         for (app_id, _), worker in self._workers.items():
             if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):

@@ -1,7 +1,7 @@
-"""Connections and their requests: each is executed once and answered as often as it is sent.
+"""Handle connections and their requests: each request is executed once and answered as often as it is sent.
 
-A client repeats a request, with the same number, until its answer arrives. A repeat of a pending request joins it; a
-repeat of a request that changed something gets the stored answer. Requests about the proxy's own state (Hello,
+A client repeats a request, with the same number, until its answer arrives. A repeat of a pending request is merged with
+it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state (Hello,
 authority, Ping) are answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
 Requests that may involve the driver are answered on a separate thread.
 """
@@ -38,17 +38,17 @@ from skyloop.proxy.core.command_checks import Intents
 from skyloop.proxy.events import Counters, Episodes
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_PENDING: Final = 16  #: waiting requests of one application; further ones are refused
-#: More malformed packets than this within a second end the connection: its two ends no longer speak the same protocol.
+MAX_PENDING: Final = 16  #: maximum number of an application's waiting requests; further ones are refused
+#: More malformed packets than this within a second end the connection, whose ends evidently speak different protocols.
 MAX_MALFORMED: Final = 50
 #: Time limit for a connection's Hello, which clients send at once.
 HELLO_NS: Final = 5 * NS_PER_S
 
-MAX_KEPT: Final = 32  #: answers stored for repeats, per connection: clients repeat a request for a few seconds at most
-MAX_MESSAGE: Final = 1000  #: characters of a refusal
+MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat requests for a few seconds at most
+MAX_MESSAGE: Final = 1000  #: characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
-#: Requests that change something. Others may be answered again, with the state at that time.
+#: Requests that change something. Others may be answered again, with the state at the time of the repeat.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 _log = logging.getLogger(__name__)
@@ -75,13 +75,13 @@ class Session:
         self.peer = peer
         self.joined_ns = joined_ns
         self.app_id = peer.id
-        self.name = f"application {peer.id}"  #: until its Hello
+        self.name = f"application {peer.id}"  #: name of the application, preliminary until its Hello
         self.role: Role | None = None
         self.intents = Intents()
         self.episodes = Episodes()
         self.answers = Answers()
-        self.authority_request = 0  #: number of the newest request for, or release of, the authority
-        self.ended = False  #: disconnected by the proxy: further packets are ignored
+        self.authority_request = 0  #: number of the newest request to acquire or release the authority
+        self.ended = False  #: whether the proxy has disconnected it, so that further packets are ignored
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
@@ -98,14 +98,14 @@ class Answers:
     __slots__ = ("_forgotten", "_pending", "kept")
 
     def __init__(self) -> None:
-        self.kept: dict[int, bytes] = {}  #: by number of the request
+        self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request
         self._pending: set[int] = set()
-        self._forgotten = 0  # highest number whose answer was stored and dropped again
+        self._forgotten = 0  # highest request number whose answer was stored but has been dropped
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
-        """Note a request as pending, unless it must not be; at most ``most`` are pending at a time.
+        """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
 
-        Returns whether it has been or is being executed, and whether the limit is reached.
+        Returns whether it has been or is being executed, and whether the limit has been reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -114,7 +114,7 @@ class Answers:
         return repeated, full
 
     def end(self, number: int, answer: bytes | None) -> None:
-        """Note that a request is answered; ``answer`` is stored for repeats. None: it may be executed again."""
+        """Mark a request as answered; ``answer`` is stored for repeats. If it is None, the request may be repeated."""
         self._pending.discard(number)
         if answer is None:
             return
@@ -129,13 +129,13 @@ class JobQueue(Protocol):
     """Runs jobs one after another, on a thread that may be shared with other proxies."""
 
     def start(self) -> None:
-        """Start to run jobs."""
+        """Start running jobs."""
 
     def put(self, job: Callable[[], None]) -> None:
         """Queue a job, which must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """End after the current job; one that hangs for longer is left to its daemon thread."""
+        """End after the current job; if that hangs for longer, it is left to its daemon thread."""
 
 
 class JobThread:
@@ -166,16 +166,16 @@ class JobThread:
                 _log.exception("a request could not be answered")
 
 
-#: Answers one type of request: for a connection, a body, and the time of reception [ns].
+#: Answers one type of request, given the connection, the body, and the time of reception [ns].
 Answer = Callable[[Session, Any, int], AnyReply]
 
 
 class RequestDispatcher:
-    """Answers requests, on the receiving thread or on that of its jobs, from :meth:`start` to :meth:`stop`.
+    """Answers requests on the receiving thread or the thread of jobs, from :meth:`start` to :meth:`stop`.
 
-    ``immediate`` and ``deferred``: the answering functions on each thread, by type of the request's body. Deferred ones
-    may raise anything, which becomes a refusal: ``on_failure`` gets the request's name and an unexpected error, and
-    returns the text for the requester.
+    ``immediate`` and ``deferred``: the functions for these threads, by type of the request's body. Errors raised by
+    deferred ones become refusals: ``on_failure`` gets the request's name and an unexpected error, and returns the text
+    for the requester.
     """
 
     def __init__(
@@ -197,19 +197,19 @@ class RequestDispatcher:
         self._pending_lock = threading.Lock()
 
     def start(self) -> None:
-        """Start to answer deferred requests."""
+        """Start answering deferred requests."""
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
+        """End after the current job; if the driver hangs for longer, it is left to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Run a job on the thread of requests, after those that wait there. It must not raise."""
+        """Run a job, which must not raise, on the thread of requests, after those already waiting."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer at once, or later on the thread of requests. On the receiving thread."""
+        """Answer at once, or later on the thread of requests. Called on the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:
@@ -229,7 +229,7 @@ class RequestDispatcher:
             self._reply(session, request, Refused(Refusal.BUSY, why))
             return
         if isinstance(request.body, _AUTHORITY):
-            # A delayed repeat of a request must not undo the release that followed it.
+            # A delayed repeat of an old request must not undo a release that came after it.
             if request.id < session.authority_request:
                 why = "a later request for the authority, or its release, has replaced it"
                 self._finish(session, request, Refused(Refusal.NOT_FRESH, why))

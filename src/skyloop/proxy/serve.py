@@ -1,4 +1,4 @@
-"""A proxy as a process, as in ``skyloop proxy``."""
+"""Run proxies as a process, as ``skyloop proxy`` does."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits after its program has gone
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing after its program has gone
 _POLL_S: Final = 0.2
-GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then, no waiting is printed
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; waiting is printed only afterwards
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 K = TypeVar("K")
 
-#: Returns news about the keys of the network, one sentence each.
+#: Returns updates about the network's keys, one sentence each.
 Look = Callable[[], Sequence[str]]
-#: Runs beside the proxies of a process, such as an endpoint for metrics.
+#: Runs something, such as an endpoint for metrics, alongside the proxies of a process.
 Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
 class LinkLines:
-    """Lines for the terminal about one proxy's vehicle link: one for each change of the link or its reason."""
+    """Composes the lines for the terminal about a proxy's vehicle link: one per change of the link or its reason."""
 
     def __init__(self, name: str, where: str, now_ns: int) -> None:
-        """Initialise; ``where``: the vehicle and the address that serves it."""
+        """Initialise; ``where`` names the vehicle and the address that serves it."""
         self._name = name
         self._where = where
         self._began_ns = now_ns
@@ -72,16 +72,16 @@ class LinkLines:
 
 
 class Shutdown:
-    """The request to end a process with proxies, and its urgency."""
+    """A request to end a process that runs proxies, and how urgent it is."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
-        self.hurry = threading.Event()  #: don't land first
+        self.hurry = threading.Event()  #: set to end without landing first
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
         """Request the end. Thread-safe, also for signal handlers."""
-        if hurry or self.requested.is_set():  # a second signal means: at once
+        if hurry or self.requested.is_set():  # a second signal means to end at once
             self.hurry.set()
         self.reason = self.reason or reason
         self.requested.set()
@@ -103,12 +103,12 @@ def serve(
 
     ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
 
-    Writes a line to standard output that starts with ``ready`` when applications can connect and the vehicle answers.
-    Otherwise it writes ``serving`` and then, at each change, the expected event, the last failure and a remedy (not
+    Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
+    Until then it writes ``serving`` and, at each change, what it is waiting for, the last failure and a remedy (not
     with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s];
     a second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
-    which the death of the parent causes, and leaves SIGINT to the parent, because a terminal sends it to both. ``look``
-    is called several times a second; its news about the keys are logged, and published as an event.
+    which occurs when the parent dies, and leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
+    called several times a second; the updates about keys that it returns are logged, and published as an event.
 
     Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
@@ -139,12 +139,13 @@ def run(
     records: bool | None = None,
     beside: Beside | None = None,
 ) -> None:
-    """Serve several vehicles from one process, as :func:`serve` does one: several drones of one simulated world.
+    """Serve several vehicles from one process, such as the drones of one simulated world; see :func:`serve`.
 
-    Starts the proxies, and stops them at the end; writes lines for each, like :func:`serve`. ``audit``: the file of the
-    audit trail; by default each proxy has one in the user's state directory, and a private one (with ``parent_fd``) has
-    none. ``records``: whether to keep an audit trail, and a note of a flight for the next run; by default not for
-    private proxies, which are never restarted under their name. ``beside``: a context around the proxies' life.
+    Starts the proxies, and stops them at the end; writes lines for each, as :func:`serve` does. ``audit``: file for the
+    audit trail; by default each proxy has one in the user's state directory, except private ones (with ``parent_fd``).
+    ``records``: whether to keep an audit trail, and a note about the flight for the next run; by default, private
+    proxies keep none, because they are never restarted under their name. ``beside``: a context around the proxies'
+    life.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -168,16 +169,16 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            # No one restarts a private proxy, or could fly a vehicle that it leaves in the air.
+            # A private proxy is never restarted, and no one could fly a vehicle that it leaves in the air.
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
                 within_s = max(within_s, ORPHAN_LANDS_WITHIN_S)
         lines = [_announced(proxy) for proxy in proxies]
-        # Wakes now and then: the kernel may deliver a signal to any thread, which does not wake this one.
+        # Wake periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
                 _publish_keys(proxies, change)
-            if parent_fd is None:  # a parent gets the proxy's events, and may not read this output
+            if parent_fd is None:  # a parent gets the proxy's events, and might not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
 
@@ -191,7 +192,7 @@ def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
     """Give a proxy its audit trail.
 
-    Raises :class:`UsageError` if a requested file can't be written; the default one may be missing.
+    Raises :class:`UsageError` if a requested file can't be written; the default file is optional.
     """
     chosen = path or audit_path(proxy.name)
     try:
@@ -203,9 +204,9 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 
 
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
-    """End several proxies at the same time, with :meth:`Proxy.end`; then raise the first of their errors.
+    """End several proxies at the same time with :meth:`Proxy.end`, then raise the first of their errors.
 
-    Ctrl-C, if nothing else handles it, ends the wait for landings, and is raised when all have ended.
+    Ctrl-C, unless it is handled elsewhere, ends the wait for landings, and is raised when all have ended.
     """
     raised: list[Exception] = []
     with interrupt_deferred() as interrupted:
@@ -231,18 +232,18 @@ def at_once(
     over: Callable[[K], bool] = lambda _: False,
     daemon: bool = False,
 ) -> None:
-    """Run the ends of several flights at the same time, and wait for all.
+    """End several flights at the same time, and wait for all.
 
     Args:
-        ends: The functions that end them, each run in its own thread; must not raise.
-        tell: Called with those without a thread, before the first of them ends: they run one after another.
+        ends: The functions that end the flights, each run in its own thread; they must not raise.
+        tell: Called with the ones for which there is no thread, before they are run one after another.
         over: Returns whether to stop waiting for one.
-        daemon: Whether the program may end before them.
+        daemon: Whether the program may end before they do.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
         thread = threading.Thread(target=end, name="skyloop-end", daemon=daemon)
-        with suppress(RuntimeError):  # no thread is available: it still ends, below
+        with suppress(RuntimeError):  # no thread is available, so it is run below
             thread.start()
             threads[one] = thread
     left = [one for one in ends if one not in threads]
@@ -254,13 +255,13 @@ def at_once(
     for one in left:
         ends[one]()
     for one, thread in threads.items():
-        while thread.is_alive() and not over(one):  # wakes now and then, for signals
+        while thread.is_alive() and not over(one):  # wake periodically to handle signals
             thread.join(_POLL_S)
 
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Let SIGINT (unless the parent handles it) and SIGTERM request the end. On the main thread."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. On the main thread."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
@@ -298,5 +299,5 @@ def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
 
 
 def _announce(line: str) -> None:
-    with suppress(OSError):  # no one reads standard output: keep serving
+    with suppress(OSError):  # standard output has no reader: keep serving
         print(line, flush=True)

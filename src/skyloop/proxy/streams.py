@@ -1,8 +1,8 @@
-"""H.264 encoded as subscribers request it: each form is encoded once, in its own thread, however many watch it.
+"""Encode H.264 as subscribers request it: each form once, in its own thread, for all of its subscribers.
 
-A form with a fixed rate is shared by all who request it. A form with a subscriber's name is for that subscriber alone;
-its rate and size follow the path to it, judged by its acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a form forwards it unchanged while the path carries it, and encodes otherwise.
+A form with a fixed rate is shared by all that request it. A form with a subscriber's name is for that subscriber alone;
+its rate and size are adapted to the path, judging by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
+vehicle itself sends H.264, such a form forwards it unchanged while the path can carry it, and otherwise encodes.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from skyloop.pyav import H264Encoder, require_pyav
 from skyloop.transport.base import TransportServer
 from skyloop.transport.frame_encoding import resized_header
 
-MAX_FORMS: Final = 16  #: for all cameras together: each costs its own encoding
+MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
 KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requested key pictures
-IDLE_S: Final = 1.0  #: a form without subscribers for this long ends its thread
-GOOD_BITS: Final = 0.2  #: bits per pixel of a picture: more is not worth the bytes
+IDLE_S: Final = 1.0  #: a form ends its thread after this time without subscribers
+GOOD_BITS: Final = 0.2  #: bits per pixel beyond which a picture hardly improves
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-_FPS: Final = 30.0  # for cameras that do not announce a rate
-_BETTER_NS: Final = nanoseconds(3.0)  # wait before a larger picture, because each change costs a key picture
-#: Share of the path's rate at which forwarding of the vehicle's own pictures may start, and continue.
+_FPS: Final = 30.0  # assumed rate of cameras that do not announce one
+_BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the picture, because each change costs a key picture
+#: Fraction of the path's rate up to which forwarding the vehicle's own pictures may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
-#: After they overloaded the path, they are retried after this time, which doubles with each failure.
+#: If they overload the path, they are retried after this time, which doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # highest rate tried for them [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
-_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without a picture for this long, the vehicle has stopped sending them
+_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without a picture for this long, the vehicle has stopped
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with a reason for people."""
+    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with a readable reason."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class StreamForm:
         self.topic = topic
         self.request = request
         self.asked_ns = 0
-        self.skipped = 0  #: pictures not encoded for lack of room on the path or in the encoder
+        self.skipped = 0  #: number of pictures not encoded, because the path or the encoder was busy
         self._fps = camera.fps if camera.fps > 0.0 else _FPS
         if request.max_fps is not None:
             self._fps = min(self._fps, request.max_fps)
@@ -83,11 +83,11 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own pictures may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether they are, while they arrive
+        self._passing = False  # whether they are being forwarded while they arrive
         self._own_ns = 0  # when the newest of them arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
-        self._changed = threading.Condition()  # guards all of the following, and the rate
+        self._changed = threading.Condition()  # guards everything below, and the rate
         self._newest: _Picture | None = None
         self._subscribers = 0
         self._wants_key = True
@@ -95,35 +95,35 @@ class StreamForm:
         self._thread: threading.Thread | None = None
         self._ended = False
         self._encoder: H264Encoder | None = None
-        self._needs_encoder = False  # a new encoder is needed
+        self._needs_encoder = False  # whether a new encoder is needed
         self._own_kbit_s = 0.0  # rate of the vehicle's own pictures; 0: unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # so that a recreated form continues with higher numbers
+        self._seq = clock() // 1_000_000  # a time, so that a recreated form continues with higher numbers
 
     @property
     def passing(self) -> bool:
-        """Whether the vehicle's own pictures are being forwarded: not if it has stopped sending them."""
+        """Whether the vehicle's own pictures are being forwarded; False if it has stopped sending them."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
     @property
     def max_fps(self) -> float:
-        """Maximum rate of frames that it uses; infinity: all."""
+        """Maximum rate of frames that it uses; infinity if it uses all."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
-        """Switch to encoding, starting with a key picture. The lock is held."""
+        """Switch back to encoding, starting with a key picture. The lock is held."""
         self._passing, self._wants_key, self._needs_encoder = False, True, True
 
     def asked(self) -> None:
-        """Note a new subscription. A subscriber that returns after a lost link acknowledges no earlier pictures."""
+        """Handle a new subscription. A subscriber that returns after a lost link won't acknowledge earlier pictures."""
         with self._changed:
             self._wants_key = True
             if self._rate is not None:
                 self._rate.forget()
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
-        """Return whether to encode a frame. On the thread that publishes it; call it once for each."""
+        """Return whether to encode a frame. Call it once per frame, on the thread that publishes it."""
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
@@ -137,7 +137,7 @@ class StreamForm:
             return self._limiter.in_time(header.captured_ns)
 
     def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for encoding, in place of a waiting one; its bytes must not change."""
+        """Queue a frame for encoding, replacing a waiting one; its bytes must not change afterwards."""
         with self._changed:
             if self._ended:
                 return
@@ -153,12 +153,12 @@ class StreamForm:
         """Handle a subscriber's report: its newest picture, and whether it needs a key picture."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
-            # A number that was never sent here would distort the measured path.
+            # A number that this form never sent would distort the measurement of the path.
             if self._rate is not None and report.seq <= self._seq:
                 self._rate.acknowledged(report.seq, now_ns)
 
     def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
-        """Handle a whole picture encoded by the vehicle; return it in publishable form, or None to drop it."""
+        """Handle a whole picture encoded by the vehicle; return it ready to publish, or None to drop it."""
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
@@ -167,7 +167,7 @@ class StreamForm:
                 self._passing = False
                 return None
             fits = rate.may_send(now_ns)
-            # Each picture refers to the previous one: after skipping one, encode until the vehicle's next key picture.
+            # Each picture refers to the previous one; after skipping one, encode until the vehicle's next key picture.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
                 if not self._wants_key:  # it was too much for the path
                     self._try_ns = now_ns + self._again_ns
@@ -186,7 +186,7 @@ class StreamForm:
         self._own_bytes += size
         passed_ns = now_ns - self._own_since_ns
         if passed_ns >= _MEASURE_NS:
-            # After a pause, the average would be too low: start a new measurement instead.
+            # After a pause, the average would be too low, so start a new measurement instead.
             if passed_ns < 2 * _MEASURE_NS:
                 self._own_kbit_s = self._own_bytes * 8e6 / passed_ns
             self._own_bytes, self._own_since_ns = 0, now_ns
@@ -212,7 +212,7 @@ class StreamForm:
     def _next(self) -> _Picture | None:
         with self._changed:
             if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
-                # Under the lock: a put() that comes now starts another thread.
+                # The lock is held, so a later put() starts another thread.
                 self._thread = None
                 self._encoder = None
                 self._wants_key = True
@@ -242,7 +242,7 @@ class StreamForm:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
             if self._passing:
-                return  # the vehicle's own pictures have taken over
+                return  # the vehicle's own pictures have replaced it
             self._seq += 1
             seq = self._seq
             if is_key:
@@ -255,7 +255,7 @@ class StreamForm:
         )
 
     def _follow_path(self, header: FrameHeader) -> int:
-        """Choose the rate and, to match it, the size and the frame rate; return the rate [kbit/s]."""
+        """Choose the rate, and the size and frame rate that match it; return the rate [kbit/s]."""
         if self._rate is None:
             return self._kbit_s
         now_ns = self._clock()
@@ -285,7 +285,7 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a form can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
+        """Return why a form can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
                 f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "
@@ -305,7 +305,7 @@ class Streams(Forms[StreamForm]):
         )
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the maximum frame rate of this camera's encoded forms that have subscribers."""
+        """Return the highest frame rate among those of this camera's encoded forms that have subscribers."""
         watched = (
             one.max_fps
             for one in self.known
@@ -320,7 +320,7 @@ class Streams(Forms[StreamForm]):
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame in the forms that need it. It is copied once if any does."""
+        """Queue a frame in the forms that need it, copying it once if there are any."""
         camera = header.camera
         wanted = [
             form
@@ -329,7 +329,7 @@ class Streams(Forms[StreamForm]):
         ]
         if not wanted:
             return
-        copy = pixels.reshape(-1).copy()  # unlike tobytes(), lets other threads run
+        copy = pixels.reshape(-1).copy()  # unlike tobytes(), this lets other threads run
         for form in wanted:
             form.put(header, copy)
 
@@ -343,7 +343,7 @@ class Streams(Forms[StreamForm]):
                     self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
-        """Handle a subscriber's report; return why it makes no sense, empty if it does."""
+        """Handle a subscriber's report; return why it makes no sense, or an empty text."""
         form = self.find(report.topic)
         if form is not None:
             form.report(report, self._clock())
@@ -366,12 +366,12 @@ class Streams(Forms[StreamForm]):
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
-    """Return the size of the encoded picture [px], both even because colours have half the resolution."""
+    """Return width and height of the encoded picture [px], which are even because colours have half the resolution."""
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 
 def _image(picture: _Picture) -> tuple[NDArray[np.uint8], str]:
-    """Return a frame's image and FFmpeg's name of its format."""
+    """Return a frame's image and FFmpeg's name for its format."""
     header, pixels = picture.header, picture.pixels
     channels = _CHANNELS.get(header.encoding)
     if channels is not None:

@@ -1,11 +1,11 @@
-"""The demands of time, links and the authority on a flight, and the one lock around every decision about it.
+"""React to time, links and the authority during a flight; every decision about it is made under one lock.
 
-Every decision is made under this lock, which is held during the driver's call, too. The transport's threads bring
-commands and requests for the authority (:mod:`skyloop.proxy.handler`), the ticker brings the time. The decisions
-themselves are pure, in :mod:`skyloop.proxy.core`.
+The lock is also held while the driver is called. The transport's threads bring commands and requests for the authority
+(:mod:`skyloop.proxy.handler`), the ticker brings the time. The decisions themselves are pure, in
+:mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing called under those two calls back here; a
-driver publishes what it receives from any thread without this lock.
+Lock order: this lock first, then the publisher's, then the events'. Nothing called under the latter two calls back into
+this module; a driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
-_NOTICED_M_S: Final = 0.05  #: smaller reductions of the software autopilot's steps are not reported
-#: Additional sleep of the computer that counts: less can't be distinguished from a delay.
+_NOTICED_M_S: Final = 0.05  #: reductions of the software autopilot's steps that are smaller than this are not reported
+#: Minimum additional sleep of the computer to react to; less can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
 class FlightSupervisor:
-    """Authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
+    """Supervises authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections by number of the application, read here and changed by the proxy. ``slept``: returns
+    ``sessions``: the connections, by number of the application; read here and changed by the proxy. ``slept``: returns
     how long the computer has slept in total [ns].
     """
 
@@ -97,7 +97,7 @@ class FlightSupervisor:
             why_not=executor.why_not,
             native=executor.native,
         )
-        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock: is the flight ours?
+        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock; True: the flight is ours
         self._returns = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
@@ -109,30 +109,30 @@ class FlightSupervisor:
         self._subscribers = server.subscribers
         self._sessions = sessions
         self._clock = clock
-        self._left = False  # the proxy is ending: it makes no more decisions about the flight
-        self._pilot = "none"  # why there is no holder of the authority, or "held"
-        self._breaks_seen = 0  # breaks of the vehicle link at the last check
-        self._heard_ns = -LATEST_NS  # when the vehicle was last received, as far as a tick noticed
+        self._left = False  # the proxy is ending, and makes no more decisions about the flight
+        self._pilot = "none"  # "held", or why the authority has no holder
+        self._breaks_seen = 0  # number of breaks of the vehicle link at the last check
+        self._heard_ns = -LATEST_NS  # when a tick last noticed that the vehicle is being received
         self._slept = slept
         self._slept_seen = slept()  # value at the last check
-        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and the time of waking
-        #: Deadline for a take-off that the vehicle got but does not show yet; None: there is none.
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and when it ended
+        #: Deadline for a take-off that was sent but has had no visible effect yet; None if there is none.
         self._rising_until_ns: int | None = None
-        self._drifts = False  # of the software autopilot; as last reported
+        self._drifts = False  # whether the software autopilot drifts, as last reported
         self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
-        self._episodes = Episodes()  # of limits on the proxy's actions without a pilot
+        self._episodes = Episodes()  # episodes of limits on the proxy's own actions, without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
-        """Start the run, before the server starts. A flight of an earlier run waits for its pilot."""
+        """Start the run, before the server starts. A flight from an earlier run waits for its pilot."""
         self.authority.last_command_ns = now_ns
 
     def tick(self, now_ns: int) -> None:
-        """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace.
+        """Update authority and failsafe, and step the software autopilot. Call at a steady pace.
 
-        If the driver failed to report who flies the vehicle, raises its error after everything else is done.
+        If the driver failed to report who flies the vehicle, its error is raised after everything else is done.
         """
         with self._lock:
             if self._left:
@@ -170,10 +170,10 @@ class FlightSupervisor:
     # The vehicle link, and whose flight it is; under the lock -------------------------------------------------------
 
     def _observe_link(self, now_ns: int) -> None:
-        """Act on changes of the vehicle link since the last call.
+        """React to changes of the vehicle link since the last call.
 
-        Intents end when the link breaks and when it returns, so that nothing from before is executed later.
-        Both times the vehicle gets a hover, because a driver must not continue an old set-point. A landing stays.
+        Intents end when the link breaks and again when it returns, so that nothing old is executed later.
+        Both times a hover is sent, because a driver must not continue an old set-point. A landing continues.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -190,10 +190,10 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Abandon a hover or landing of a vehicle that has long been silent: it may be on another flight by then.
+        """Abandon a hover or landing if the vehicle has long been silent, as it may be on another flight by then.
 
-        After a landing by the ladder, a vehicle found in the air belongs to others at once: no pilot is there to claim
-        it. In all other cases that is decided when the vehicle is received again, because its pilot may be there.
+        After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
+        to claim it. Otherwise this is decided when the vehicle is received again, because its pilot may be present.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -216,7 +216,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """Act on a sleep of the computer: all known times are older than the clock shows."""
+        """React to a sleep of the computer, after which everything is older than its timestamp suggests."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -228,13 +228,13 @@ class FlightSupervisor:
         self._start_over(Fate.SLEPT, now_ns)
 
     def _observe_position(self, now_ns: int) -> None:
-        """Note the vehicle's position; hover if it jumped, because the request was meant for another place."""
+        """Update the vehicle's position; hover if it has jumped, because the request was meant for another place."""
         airspace = self.checks.airspace
         airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # a recording has no pilot
-            lands = self._asked(Land) is not None or self.ladder.continues_landing  # a landing is fine anywhere
+            lands = self._asked(Land) is not None or self.ladder.continues_landing  # a landing is safe anywhere
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
@@ -248,7 +248,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_vehicle(self, now_ns: int) -> Snapshot:
-        """Observe the vehicle, and act on a change of hands of its flight."""
+        """Observe the vehicle, and react if its flight has changed hands."""
         executor, flight = self._executor, self.flight
         changed = executor.observe(now_ns)
         if self.on_ownership is not None and not flight.awaited:  # otherwise the note stays unchanged
@@ -259,7 +259,7 @@ class FlightSupervisor:
                 executor.stop_autopilot()
                 why = f"{flight.others}: hover, take off or land first to take it over"
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
-            elif changed.why:  # a flight of ours turned up: its pilot may return, so the silence starts now
+            elif changed.why:  # our own flight has turned up, and its pilot may return: measure the silence from now
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
             if changed.why and executor.supported:  # a replay has no pilot to surprise
                 self._events.publish_drafts(ownership_event(changed))
@@ -274,7 +274,7 @@ class FlightSupervisor:
         return None if holder is None else self._sessions.get(holder.app_id)
 
     def _asked(self, *kinds: type[Action]) -> Intent | None:
-        """Return the holder's intent if it is of one of these kinds and in progress."""
+        """Return the holder's intent if it is in progress and of one of these kinds."""
         session = self._holder
         newest = None if session is None else session.intents.newest
         return newest if newest is not None and type(newest.action) in kinds and not newest.over else None
@@ -288,11 +288,11 @@ class FlightSupervisor:
         self._withdraw_takeoff(now_ns)
 
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
-        """End or complete the holder's intent by the vehicle's actions; return the flight state."""
+        """End or complete the holder's intent according to the vehicle's actions; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
-                self._observe_vehicle(now_ns)  # a landing may be by others: then that ended it
+                self._observe_vehicle(now_ns)  # others may have landed the vehicle, which would have ended the intent
             feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
@@ -312,21 +312,21 @@ class FlightSupervisor:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
-        """Cancel a take-off that the vehicle does not show yet; return whether there was one.
+        """Cancel a take-off that has had no visible effect yet; return whether there was one.
 
-        A landing from the ground makes the vehicle forget an arming that is still on its way.
+        A landing sent to a vehicle on the ground cancels an arming that is still in progress.
         """
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
         if self._executor.attempt(_LAND, now_ns, "apply"):
             self.flight.call_off(now_ns)
-        elif self.flight.ours:  # retry while that take-off may still show
+        elif self.flight.ours:  # retry while that take-off may still take effect
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
     def _report_intent(self, session: Session) -> None:
-        """Show the outcome of an application's newest intent in feedback, an end soon."""
+        """Publish the outcome of an application's newest intent in feedback, soon if it has ended."""
         self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
@@ -338,7 +338,7 @@ class FlightSupervisor:
     def _report_limits(
         self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
     ) -> None:
-        """Publish limits that start to affect this application's commands, or the proxy's own actions."""
+        """Publish limits that begin to affect this application's commands, or the proxy's own actions."""
         if enforced is not None and enforced is not self._enforced:
             self._enforced = enforced
             self._events.publish_drafts(enforcement_event(enforced))
@@ -347,7 +347,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow for a step of the software autopilot."""
+        """Return the nearest velocity that limits, safety box and zones allow the software autopilot for a step."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
@@ -374,7 +374,7 @@ class FlightSupervisor:
                 session.intents.end(Fate.AUTHORITY)
                 self._report_intent(session)
                 self._withdraw_takeoff(now_ns)
-        drafts = self._act(now_ns, stamps=True)  # hovers before anyone learns about the changes
+        drafts = self._act(now_ns, stamps=True)  # hover before the changes are published
         holder = self.authority.holder
         told = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
         ended = [draft for one, draft in told if isinstance(one, Lost | Preempted)]
@@ -382,7 +382,7 @@ class FlightSupervisor:
         self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:
-        """Show the holder, the failsafe's step and whose flight it is in feedback."""
+        """Update the holder, the failsafe's step and the flight's owner in feedback."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
         self._publisher.stamp(
@@ -413,11 +413,11 @@ class FlightSupervisor:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._observe_vehicle(now_ns)
-        # An abandoned flight may be another one by now, unless the software autopilot kept steering it, or it lands.
+        # An abandoned flight may be a different one by now, unless the software autopilot kept steering, or it lands.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._observe_vehicle(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
-            ladder.continue_landing(now_ns)  # no hover may take back its pilot's landing
+            ladder.continue_landing(now_ns)  # a hover must not interrupt its pilot's landing
         inputs = FailsafeInputs(
             state=seen.state,
             airborne=flight.flies(seen.state),

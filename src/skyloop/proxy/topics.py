@@ -1,6 +1,6 @@
-"""The topics of a proxy: their names, feedback at reduced rates, and the overview.
+"""A proxy's topics: their names, feedback at reduced rates, and the overview.
 
-No other topic can be subscribed to, so that invented names cost nothing.
+No other topics can be subscribed to, so that made-up names cost nothing.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from skyloop.transport.base import (
     video,
 )
 
-#: Topics without a name in them.
+#: Topics that don't contain a name.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
-STREAM_TOPIC: Final = stream("")  #: prefix of the topics of streams
-PREFIX: Final = f"{FEEDBACK}?"  #: prefix of each form of feedback
+STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
+PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each form of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
-MAX_VARIANTS: Final = 16  #: simultaneous forms of feedback, whatever their number of subscribers
-#: A requested form without subscribers keeps its place for this long: its subscription may be on the way.
+MAX_VARIANTS: Final = 16  #: maximum number of simultaneous forms of feedback, each with any number of subscribers
+#: How long a requested form keeps its place without subscribers, because a subscription may be in transit.
 KEEP_NS: Final = nanoseconds(5.0)
-PERIOD_NS: Final = nanoseconds(1.0)  #: between two overviews
-_FRESH_NS: Final = PERIOD_NS // 2  # a younger overview is sent again instead of a new one
+PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
+_FRESH_NS: Final = PERIOD_NS // 2  # an overview younger than this is sent again instead of a new one
 _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, with the available ones; empty if it can.
+    """Return why a topic can't be subscribed to, naming the available ones; empty if it can.
 
     A processor's results may be subscribed to before it has a worker.
     """
@@ -66,7 +66,7 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
 
 
 def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why this is not one of the vehicle's cameras, with those that are; empty if it is."""
+    """Return an error that lists the vehicle's cameras; empty if this is one of them."""
     known = cameras()
     return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message
 
@@ -78,7 +78,7 @@ class Form(Protocol):
     """A form of samples, published on one topic."""
 
     topic: str
-    asked_ns: int  #: time of the newest request for it
+    asked_ns: int  #: time of the newest request for this form
 
 
 F = TypeVar("F", bound=Form)
@@ -145,7 +145,7 @@ class FeedbackVariants(Forms[_Variant]):
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
-        """Publish a sample in each form in which it is due. One thread at a time.
+        """Publish a sample in each form for which it is due. One thread at a time.
 
         ``now_ns`` is not the capture time, which does not advance while the vehicle is silent.
         """
@@ -157,7 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # native telemetry, as already reported
+            except (ValueError, TypeError, OverflowError):  # in native telemetry, which has been reported already
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -169,7 +169,7 @@ class FeedbackVariants(Forms[_Variant]):
 
 
 class OverviewRegistry:
-    """The rows of all proxies of a process, encoded once for all that publish them. Thread-safe."""
+    """The rows of all proxies in a process, encoded once for all of them. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -191,7 +191,7 @@ class OverviewRegistry:
             self._made_ns = None
 
     def packets(self, now_ns: int) -> list[bytes]:
-        """Return the current overview, encoded in as many packets as it needs."""
+        """Return the current overview, encoded as as many packets as needed."""
         with self._lock:
             if self._made_ns is None or not 0 <= now_ns - self._made_ns < _FRESH_NS:
                 rows = sorted((row() for row in self._sources), key=lambda row: row.name)
@@ -205,20 +205,20 @@ class OverviewRegistry:
 class OverviewPublisher:
     """Publishes the overview on one proxy's transport once a second, while it has subscribers.
 
-    A new subscriber gets one at once.
+    A new subscriber gets an overview at once.
     """
 
     def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
-        self.registry = OverviewRegistry()  #: whose rows are published; by default only its own
+        self.registry = OverviewRegistry()  #: provides the published rows; by default only the proxy's own
         self._server = server
         self._row = row
         self._subscribers = 0
         self._due_ns = 0
 
     def share(self, registry: OverviewRegistry) -> None:
-        """Publish the rows of others, too, and share one's own row. Call before :meth:`begin`.
+        """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy and not to another: they would see the others' rows.
+        Does nothing if applications may have access to one proxy but not another, as they would see the others' rows.
         """
         if not self._server.restricted:
             self.registry = registry
@@ -241,7 +241,7 @@ class OverviewPublisher:
 
 
 def _encoded(page: Overview) -> list[bytes]:
-    """Encode rows in one packet, or in several if they do not fit."""
+    """Encode rows as one packet, or as several if they don't fit."""
     try:
         return [encode(page)]
     except ValueError:

@@ -1,7 +1,7 @@
-"""The contract of every transport.
+"""The contract for all transports.
 
 A transport carries whole packets between one proxy (the *transport server*) and any number of applications (*transport
-clients*). It knows packets and topics, but not their meaning. An implementation passes the tests of
+clients*). It knows packets and topics, but not their meaning. An implementation must pass the tests in
 :mod:`skyloop.transport.conformance`.
 
 - No call ever blocks on the other end. A packet that does not fit at that moment is not sent, and the caller gets
@@ -10,7 +10,7 @@ clients*). It knows packets and topics, but not their meaning. An implementation
   :data:`MAX_PACKET` bytes; sending any other raises :class:`skyloop.errors.UsageError`.
 - Handlers run on the transport's receiving threads, one call at a time per end, so they must return quickly. A handler
   that raises ends its own connection, not the transport.
-- When one end goes away, for whatever reason, the other one's handler is called once: ``peer_left`` or ``closed``.
+- When one end goes away, for whatever reason, the handler at the other end is called once: ``peer_left`` or ``closed``.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 
-#: The topics of a client. An application that needs neither ``feedback`` nor ``events`` need not subscribe to them.
+#: The topics that clients can subscribe to. Even ``feedback`` and ``events`` are optional.
 FEEDBACK = "feedback"
 EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: log entries of applications (LogEntry)
 OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
-MAX_TOPIC = 200  #: characters
-MAX_SUBSCRIPTIONS = 64  #: topics of one connection at the same time
+MAX_TOPIC = 200  #: characters in a topic's name
+MAX_SUBSCRIPTIONS = 64  #: maximum number of simultaneous topics per connection
 RESULTS = "results"  #: results of all processors (ProcessorResult)
-MAX_PACKET = HEADER_SIZE + MAX_BODY  #: bytes
+MAX_PACKET = HEADER_SIZE + MAX_BODY  #: maximum size of a packet [bytes]
 
 
 def video(camera: str) -> str:
@@ -47,7 +47,7 @@ def video(camera: str) -> str:
 
 
 def stream(camera: str) -> str:
-    """Return the topic of a camera's pictures as the vehicle encoded them (EncodedFrame)."""
+    """Return the topic of a camera's pictures as encoded by the vehicle (EncodedFrame)."""
     return f"stream/{camera}"
 
 
@@ -67,7 +67,7 @@ class Peer:
     """The transport server's view of an application's connection."""
 
     id: int  #: unique in this run of the transport server, from 1
-    address: str  #: for people: process id and user, or host and port
+    address: str  #: readable address: process id and user, or host and port
 
 
 NOBODY = Peer(0, "an unknown application")
@@ -95,23 +95,23 @@ class ServerHandler(Protocol):
         """
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle the refusal of a packet that the application's keys do not allow; it is not delivered.
+        """Handle the refusal of a packet that the application's keys do not allow, and that is not delivered.
 
         Args:
-            peer: The sender; :data:`NOBODY` where the connection is unknown.
-            reason: The reason, for people.
+            peer: The sender; :data:`NOBODY` if the connection is unknown.
+            reason: The reason, as readable text.
         """
 
     def topic_problem(self, topic: str) -> str:
         """Return why a topic can't be subscribed to.
 
-        May be called on any thread, also while another callback runs, and must answer at once.
+        May be called on any thread, even while another callback runs, and must answer at once.
 
         Args:
             topic: The requested name.
 
         Returns:
-            Why there is no such topic, with the names of those that exist; empty if it exists.
+            Why there is no such topic, and which topics there are; empty if it exists.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -121,7 +121,7 @@ class ServerHandler(Protocol):
 
         Args:
             peer: The requesting application.
-            reason: The problem, for people.
+            reason: The problem, as readable text.
         """
 
     def peer_left(self, peer: Peer, reason: str) -> None:
@@ -129,7 +129,7 @@ class ServerHandler(Protocol):
 
         Args:
             peer: The connection.
-            reason: The reason, for people.
+            reason: The reason, as readable text.
         """
 
 
@@ -141,7 +141,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
-        """Begin to accept connections.
+        """Begin accepting connections.
 
         Args:
             handler: Called on the transport's receiving threads, one call at a time.
@@ -152,7 +152,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def stop(self) -> None:
-        """Disconnect every application and release every resource. Idempotent."""
+        """Disconnect all applications and release all resources. Idempotent."""
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
@@ -178,7 +178,7 @@ class TransportServer(ABC):
             packet: 1 to :data:`MAX_PACKET` bytes.
 
         Returns:
-            The number of subscribers that did *not* get it.
+            The number of subscribers that did *not* receive it.
 
         Raises:
             UsageError: The packet is empty or too large.
@@ -193,7 +193,7 @@ class TransportServer(ABC):
             pixels: ``header.size`` bytes, dtype uint8, any shape, C-contiguous; may be reused after the call.
 
         Returns:
-            The number of subscribers that did *not* get it.
+            The number of subscribers that did *not* receive it.
 
         Raises:
             UsageError: The pixels do not match the header.
@@ -201,10 +201,10 @@ class TransportServer(ABC):
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; topics without any need not be produced."""
+        """Return the number of a topic's subscribers; samples need not be produced if there are none."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
-        """Decide whether an application may stay after it has identified itself: some places are reserved for pilots.
+        """Decide whether an application that has identified itself may stay, as some places are reserved for pilots.
 
         The default admits every application.
 
@@ -223,23 +223,23 @@ class TransportServer(ABC):
 
         Args:
             peer: The application's connection.
-            reason: The reason, for people; both ends' handlers get it.
+            reason: The reason, as readable text, which the handlers at both ends get.
         """
 
     @property
     def counters(self) -> dict[str, float]:
-        """Return this end's counters since its start, by dotted name, for the proxy's statistics. Any thread."""
+        """Return this end's counters since it was started, by dotted name, for the proxy's statistics. Any thread."""
         return {}
 
     @property
     def restricted(self) -> bool:
-        """Whether access here may not imply access to other proxies, as with keys that name drones."""
+        """Whether access to this proxy may not imply access to others, as with keys that name drones."""
         return False
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """The address of this end, for people."""
+        """Readable address of this end."""
 
 
 class ClientHandler(Protocol):
@@ -257,20 +257,20 @@ class ClientHandler(Protocol):
         Args:
             header: The frame's header.
             pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. The handler may keep them, or any
-                view of them, for as long as it likes: that costs only this application.
-            topic: The subscribed topic that the frame belongs to, where :attr:`TransportClient.variants` is true.
+                view of them, for as long as it likes; that affects only this application.
+            topic: The subscribed topic that the frame belongs to, if :attr:`TransportClient.variants` is true.
         """
 
     def closed(self, reason: str) -> None:
         """Handle the end of the connection, whichever end closed it. Called once, as the last callback.
 
         Args:
-            reason: The reason, for people.
+            reason: The reason, as readable text.
         """
 
 
 class TransportClient(ABC):
-    """An application's side: one connection, made by a :data:`Dialer` and never reused after closing."""
+    """An application's side: a single connection, made by a :data:`Dialer` and not reusable once closed."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
@@ -291,7 +291,7 @@ class TransportClient(ABC):
         """Subscribe to a topic, or unsubscribe from it. Any thread.
 
         Args:
-            topic: Its name, 1 to :data:`MAX_TOPIC` characters.
+            topic: The topic's name, 1 to :data:`MAX_TOPIC` characters.
             on: True to subscribe, False to unsubscribe.
 
         Raises:
@@ -306,17 +306,17 @@ class TransportClient(ABC):
         """
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
-        """Receive on the calling thread while it waits, so that a sample wakes one thread and not two.
+        """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.
 
-        Meanwhile the handler runs on this thread, still one call at a time. The default does not support it.
+        Meanwhile the handler runs on this thread, still one call at a time. By default, this is not supported.
 
         Args:
             ready: Returns whether the wait is over; called on this thread after each packet and several times a second.
-            wake: Called once, on another thread, when a retry may succeed; not if this returns True.
-            timeout_s: How long to receive [s]; may take 50 ms longer.
+            wake: Called once, on another thread, when a retry may succeed; unused if this returns True.
+            timeout_s: How long to receive [s]; the call may take 50 ms longer.
 
         Returns:
-            True if this thread received; False if another one does, and the caller must wait as usual.
+            True if this thread has been receiving; False if another one is, so that the caller must wait as usual.
         """
         return False
 
@@ -328,7 +328,7 @@ class TransportClient(ABC):
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends read the same monotonic clock (one host), so that the offset is zero.
+        """Whether both ends read the same monotonic clock, being on one host, so that the offset is zero.
 
         An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
         """
@@ -337,7 +337,7 @@ class TransportClient(ABC):
     def variants(self) -> bool:
         """Whether frames arrive in the form that each topic requests (:class:`skyloop.messages.VideoRequest`).
 
-        Otherwise all frames arrive unchanged, and only the plain topic of a camera is available.
+        If not, all frames arrive unchanged, and each camera has only its plain topic.
         """
         return False
 
@@ -349,14 +349,14 @@ class TransportClient(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """The address that this end is connected to, for people."""
+        """Readable address that this end is connected to."""
 
 
-#: Connects and starts to deliver to the handler. Raises :class:`skyloop.errors.LinkError` if it cannot.
+#: Connects and starts delivering to the handler. Raises :class:`skyloop.errors.LinkError` if that fails.
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
-#: Valid names of a proxy: usable as a socket's file name and as one chunk of a network key.
+#: Valid names for proxies, which can be used as a socket's file name and as one chunk of a network key.
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
@@ -403,7 +403,7 @@ def check_topic(topic: str) -> None:
 
 
 def too_many_topics(topic: str) -> str:
-    """Return why an application with :data:`MAX_SUBSCRIPTIONS` topics gets no more."""
+    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics can't get more."""
     return f"{topic[:64]!r} exceeds the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
 
 

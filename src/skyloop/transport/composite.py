@@ -1,4 +1,4 @@
-"""One transport server made of several, for a proxy that serves its host and the network at the same time."""
+"""Combine several transport servers into one, for a proxy that serves its host and the network at once."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class _Member(NamedTuple):
-    """The end that an application connected to, and its peer there."""
+    """The end that an application is connected to, and its peer there."""
 
     end: TransportServer
     peer: Peer
 
 
 class CompositeServer(TransportServer):
-    """One transport server made of several, with its own numbers for their peers.
+    """One transport server that combines several, and has its own numbers for their peers.
 
-    The handler gets one call at a time, as the contract demands: an end that brings a command goes first, the others in
-    order of arrival.
+    The handler gets one call at a time, as the contract requires: an end that brings a command goes first, the others
+    in order of arrival.
 
     Args:
         ends: The transport servers, nearest first; at least one.
@@ -36,12 +36,12 @@ class CompositeServer(TransportServer):
         if not ends:
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
-        self.lock = PriorityLock()  #: the thread that holds it may call the handler
+        self.lock = PriorityLock()  #: a thread must hold it to call the handler
         self._members: dict[int, _Member] = {}  # by our number
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start to accept connections at all ends, or at none.
+        """Start accepting connections at all ends, or at none.
 
         If an end's ``start`` raises, the ends before it are stopped and the error is re-raised.
 
@@ -132,7 +132,7 @@ class CompositeServer(TransportServer):
 
 
 class _EndHandler:
-    """Handler of one end: forwards calls under the composite's lock, with the composite's peers."""
+    """The handler at one end: forwards calls under the composite's lock, with the composite's peers."""
 
     def __init__(self, whole: CompositeServer, end: TransportServer, handler: ServerHandler) -> None:
         self._whole = whole

@@ -1,4 +1,4 @@
-"""Conformance tests for transports: subclass :class:`TransportSuite` in your tests and give it your two ends.
+"""Conformance tests for transports: subclass :class:`TransportSuite` in your tests, and provide your two ends.
 
 ::
 
@@ -48,7 +48,7 @@ from skyloop.transport.testing import (
 
 
 class TransportSuite(ABC):
-    """The contract of :mod:`skyloop.transport.base` as tests.
+    """The contract in :mod:`skyloop.transport.base` as tests.
 
     A subclass implements :meth:`make_server` and :meth:`dialer`; pytest collects the inherited tests.
     """
@@ -231,7 +231,7 @@ class TransportSuite(ABC):
                 server.publish_frame(header(seq), picture(header(seq)))
                 wait_until(partial(app.log.saw, seq), "the frame arrived, whatever views are kept")
                 head, pixels = app.log.frames.pop()
-                if seq % 4 == 0:  # only a view of a view keeps it alive
+                if seq % 4 == 0:  # it is kept alive only by a view of a view
                     views[head.seq] = pixels.reshape(head.height, head.width, 3)[::2, 1::2]
                 del pixels
             app.client.close()
@@ -285,7 +285,7 @@ class TransportSuite(ABC):
     def dial_or_link_error(self, server: TransportServer) -> None:
         """Dial, and turn a ``UsageError`` into a ``LinkError``.
 
-        An unknown name is as valid an answer as a refused connection.
+        An unknown name is just as valid as a refused connection.
         """
         try:
             self.dialer(server)(ClientLog())

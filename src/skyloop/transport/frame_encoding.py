@@ -1,4 +1,4 @@
-"""Pure functions that encode frames as a request for video demands."""
+"""Pure functions that encode frames as requested."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
     """Encode a frame as requested.
 
-    A frame that is already a JPEG is returned unchanged, whatever the request.
+    A frame that is already a JPEG is returned unchanged, regardless of the request.
 
     Args:
         header: The frame's header.
@@ -54,10 +54,10 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
 
     Args:
         header: The frame's header.
-        scale: The factor for width and height [1].
+        scale: The factor for width and height.
 
     Returns:
-        The header; ``size`` is that of plain pixels.
+        The header, whose ``size`` is that of plain pixels.
     """
     return resized_header(header, max(1, round(header.width * scale)), max(1, round(header.height * scale)))
 
@@ -71,12 +71,12 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
         height: New height [px].
 
     Returns:
-        The header; ``size`` is that of plain pixels.
+        The header, whose ``size`` is that of plain pixels.
     """
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
-        # The first pixel's centre is (0, 0), so the fixed point of the scaling is its corner at (-0.5, -0.5).
+        # The centre of the first pixel is (0, 0), so the fixed point of the scaling is its corner at (-0.5, -0.5).
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )
@@ -89,7 +89,7 @@ def resized(picture: Any, header: FrameHeader) -> Any:
 
     Args:
         picture: Shape (height, width, channels), dtype uint8.
-        header: Gives the new width and height [pixels].
+        header: A header with the new width and height [px].
 
     Returns:
         The resized picture, shape (height, width, channels).

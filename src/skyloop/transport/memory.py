@@ -1,7 +1,7 @@
-"""The transport inside one process: for tests, and for a proxy and an application that share a process.
+"""The transport within one process, for tests, and for a proxy and an application that share a process.
 
-It fulfils the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so code
-that works over it works over the other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
+It fulfils the whole contract of :mod:`skyloop.transport.base`, including receiving threads and bounded queues, so code
+that works with it works with other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
 and frames, identically for the same seed.
 """
 
@@ -36,15 +36,15 @@ from skyloop.transport.base import (
 
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
-DEPTH = 256  #: packets that wait at an end; further ones are dropped
-FRAME_DEPTH = 4  #: frames of one camera that wait at a client; then the newest replaces the one before it
+DEPTH = 256  #: maximum number of packets waiting at an end; further ones are dropped
+FRAME_DEPTH = 4  #: maximum number of a camera's frames waiting at a client; the newest replaces the one before it
 
 _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
 class _What(Enum):
-    """What happened to a client, for the server's receiving thread."""
+    """What happened to a client, as reported to the server's receiving thread."""
 
     JOINED = auto()
     PACKET = auto()
@@ -52,21 +52,21 @@ class _What(Enum):
     LEFT = auto()
 
 
-_Item = tuple["MemoryClient", _What, str]  # the text of a malformed request
+_Item = tuple["MemoryClient", _What, str]  # the text describes a malformed request
 
 
 class MemoryServer(TransportServer):
     """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop.
 
     Args:
-        name: Name for its address and threads.
+        name: Name used in its address and for its threads.
         faults: Faults to inject; none by default.
     """
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
         self._faults = faults or Faults()
-        self._lock = threading.Lock()  # guards joining and leaving; never held during a handler call
+        self._lock = threading.Lock()  # guards joining and leaving; never held while the handler is called
         self._clients: dict[int, MemoryClient] = {}
         self._ids = itertools.count(1)
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
@@ -210,11 +210,11 @@ class MemoryClient(TransportClient):
         self._down = FaultInjector(faults, f"{peer.id}/down")
         self._up_lock = threading.Lock()
         self._down_lock = threading.Lock()
-        # Items: a packet, the name of a camera with a frame to deliver, or None: the connection has ended.
+        # Items: a packet, the name of a camera with a frame to deliver, or None if the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # by either end: nothing can be sent
-        self._closing = False  # by this end: nothing more is delivered
+        self._ended = False  # whether either end has ended it, so that nothing can be sent
+        self._closing = False  # whether this end has closed it, so that nothing more is delivered
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:

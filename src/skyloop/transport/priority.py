@@ -1,13 +1,13 @@
-"""Commands first: the order in which connections' packets, and the threads that bring them, reach the proxy.
+"""Commands first: the order in which packets, and the threads that bring them, reach the proxy.
 
-A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, each set-point
-that waits behind a newer one costs time and is refused in the end as stale, which makes the proxy even later. So in a
-:class:`PacketBacklog` a newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency
-stop) are kept, and only repeats of the same one are merged.
+A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, handling
+outdated set-points costs time, only for them to be refused as stale, and the proxy gets even later. Therefore in a
+:class:`PacketBacklog`, a newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency
+stop) are kept; only repeats of the same one are merged.
 
-Several threads share a :class:`PriorityLock` in order of arrival, commands first. ``threading.RLock`` goes to whichever
-thread is awake: a thread that re-acquires it in a loop can starve all others, and a command would wait behind two
-hundred requests of another application.
+Several threads share a :class:`PriorityLock` in order of arrival, commands first. A ``threading.RLock`` goes to any
+thread that is awake: one that re-acquires it in a loop can starve all others, and a command would wait behind two
+hundred requests from another application.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from skyloop.messages.codec import KINDS
 from skyloop.messages.command import SET_POINTS
 
 SUPERSEDED: Final = "commands.superseded"  #: counter of commands replaced by newer ones
-MOST_PACKETS: Final = 256  #: taken out of a socket before the first of them is handled
-MOST_BYTES: Final = 131_072  #: of these packets
+MOST_PACKETS: Final = 256  #: maximum number of packets taken out of a socket before the first of them is handled
+MOST_BYTES: Final = 131_072  #: maximum total size of these packets
 _NOTHING: Final[tuple[bytes, Command | None]] = (b"", None)
 _COMMAND: Final = bytes([KINDS[Command]])
 
 
 def is_command(packet: bytes) -> bool:
-    """Return whether a packet is a command, emergency stops included: commands are handled before everything else."""
+    """Return whether a packet is a command or an emergency stop, which is handled before everything else."""
     return packet[5:6] == _COMMAND
 
 
 class Lane(IntEnum):
-    """Class of a backlog's first packet, most urgent first."""
+    """The class of the first packet in a backlog, most urgent first."""
 
-    URGENT = 0  #: commands, at least one of them not a set-point: a landing, an emergency stop
-    STEERING = 1  #: set-points, and keep-alives in their place
+    URGENT = 0  #: commands of which at least one is not a set-point, such as a landing or an emergency stop
+    STEERING = 1  #: set-points, or keep-alives sent instead
     OTHERS = 2  #: anything else
 
 
 class PacketBacklog:
-    """The waiting packets of one connection. Not thread-safe.
+    """Holds the waiting packets of one connection. Not thread-safe.
 
     Args:
         most: Maximum number of waiting packets.
@@ -57,19 +57,19 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # numbers of the newest commands, which may have left the backlog
+        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may be gone
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     @property
     def full(self) -> bool:
-        """Whether the backlog can take no more packets for now."""
+        """Whether the backlog can't take any more packets for now."""
         return len(self._waiting) >= self._most or self._bytes >= MOST_BYTES
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the packets up to the first non-command; None if nothing waits."""
+        """The lane of the packets up to the first that is not a command; None if there are none."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -114,16 +114,16 @@ class PacketBacklog:
         return self._drop(self._last, command)
 
     def _drop(self, number: int, newer: Command) -> int:
-        """Drop an older command that still waits; return how many were dropped."""
+        """Drop an older command if it is still waiting; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # a network may reorder packets
+        if older is None or older.seq >= newer.seq:  # because a network may reorder packets
             return 0
         self._take(number)
         return 1
 
 
 def _command(packet: bytes) -> Command | None:
-    """Return the command in a packet; None for anything else, damaged ones included."""
+    """Return the command in a packet; None for anything else, including damaged commands."""
     if not is_command(packet):
         return None
     try:
@@ -140,7 +140,7 @@ class PriorityLock:
     """
 
     def __init__(self) -> None:
-        self._taken = threading.Lock()  # locked while a thread owns this lock; stays locked in a hand-over
+        self._taken = threading.Lock()  # locked while a thread owns this lock, and during a hand-over
         self._owner = 0  # identity of the owning thread
         self._depth = 0  # additional acquisitions by the owner
         self._queues = threading.Lock()  # guards the queues

@@ -1,6 +1,6 @@
-"""Helpers for tests of transports and their users: handlers that record their calls.
+"""Helpers for testing transports and their users: handlers that record their calls.
 
-Nothing here sleeps for a fixed time: :func:`wait_until` waits for a condition, for at most :data:`PATIENCE_S`.
+Nothing here sleeps for a fixed time; :func:`wait_until` waits for a condition, but no longer than :data:`PATIENCE_S`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
     Args:
         condition: Called about every millisecond until it returns something true.
-        what: The condition in words, for the failure's message.
+        what: Description of the condition, for the error message.
 
     Raises:
         AssertionError: The condition did not hold within :data:`PATIENCE_S`.
@@ -137,7 +137,7 @@ class ClientLog:
 
 
 def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> FrameHeader:
-    """Return the header of a BGR8 frame for tests; both of its stamps are ``seq`` nanoseconds."""
+    """Return the header of a BGR8 frame for tests; both of its timestamps are ``seq`` nanoseconds."""
     return FrameHeader(camera, seq, seq, seq, width, height, Encoding.BGR8, width * height * 3)
 
 
@@ -154,7 +154,7 @@ def picture(head: FrameHeader) -> Pixels:
 
 
 class Joined:
-    """A transport client that has joined, with its log and its :class:`Peer` at the server."""
+    """A transport client that has joined, its log, and its :class:`Peer` at the server."""
 
     def __init__(self, client: TransportClient, log: ClientLog, peer: Peer) -> None:
         self.client = client

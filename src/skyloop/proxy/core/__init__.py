@@ -1,1 +1,1 @@
-"""The proxy's pure decisions: inputs and the time are arguments; there are no threads, sockets, locks or clocks."""
+"""The proxy's decisions, as pure code: inputs and time are arguments; no threads, sockets, locks or clocks."""

@@ -1,11 +1,11 @@
-"""Where a vehicle may fly, and how fast: one verdict for each set-point, position, hover, take-off and step. Pure.
+"""Decide where a vehicle may fly, and how fast: a verdict on each set-point, position, hover, take-off, step. Pure.
 
 Every wall is a plane: those of the safety box and, for each no-fly zone, the plane through its nearest point that is
-perpendicular to the line of sight. All of the zone lies behind that plane, because zones are convex. Inside a zone, the
-plane through which the vehicle entered stays, so that the vehicle is led back to its own side. At distance ``d`` from a
-plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the reaction time ``t`` (plus
-the age of the position) and the deceleration ``a``. A velocity keeps its component along the plane. An attitude passes
-unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
+perpendicular to the line of sight. The whole zone is behind that plane, because zones are convex. Inside a zone, the
+plane through which the vehicle entered is kept, so that the vehicle is led back to the side it came from. At distance
+``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the reaction time
+``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its component along the plane. An
+attitude passes unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
 """
 
 from __future__ import annotations
@@ -22,51 +22,51 @@ from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, AirspaceSettings
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
-LOST_NS: Final = 2 * NS_PER_S  #: an older position is not worth waiting for
-BLIND_M: Final = 0.5  #: longest flight between walls to a position without a new measured one
-#: A position that changes by more than this, and by more than the vehicle can have flown since, has jumped.
+LOST_NS: Final = 2 * NS_PER_S  #: age of a position beyond which it is not worth waiting for the next
+BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
+#: A position has jumped if it changes by more than this, and by more than the vehicle can have flown.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; beyond that, only coming back is allowed
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further beyond, only coming back is allowed
 BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed of leading back a vehicle that asks to go on beyond a wall
-#: A hovering vehicle this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
+RETURN_M_S: Final = 0.5  #: maximum speed at which a vehicle is led back if it requests to fly on beyond a wall
+#: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
 TAKEOFF_M: Final = 1.0  #: assumed minimum height of a take-off
-LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: a vehicle may stand on a table that is one
+LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be the table that the vehicle is on
 
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
-_BLIND_S: Final = 0.1  # covered by the reaction time
-_OLD_S: Final = 1.0  # maximum age of a position: the vehicle may be at rest after all
-_AT_REST_M_S: Final = 0.05  # slower vehicles may repeat the same position
-_GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that one wrong value has no effect
-_NO_WAY_M: Final = 0.05  # this close to the target, there is no direction to apply limits to
-_PASSES: Final = 8  # rounds of shortening by all walls in turn, before demanding a stop
+_BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
+_OLD_S: Final = 1.0  # maximum age counted for a position, because the vehicle may be at rest
+_AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
+_GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
+_NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
+_PASSES: Final = 8  # how often a velocity is reduced by all walls in turn before a stop is demanded
 
 
 class Verdict(NamedTuple):
-    """The decision about a request."""
+    """The decision on a request."""
 
     action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
     clamps: tuple[Clamp, ...] = ()  #: the limits that applied
-    refusal: Refusal | None = None  #: None without an action: the action resumes with the next fresh position
-    why: str = ""  #: reason of the refusal, for people
-    enforced: bool | None = None  #: whether the safety box and zones could be enforced; None: there are none
+    refusal: Refusal | None = None  #: None if there is no action either: it resumes at the next fresh position
+    why: str = ""  #: readable reason for the refusal
+    enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
 
 
 class Airspace:
-    """Judges the actions requested of one vehicle by its position."""
+    """Judges the actions requested of one vehicle, given its position."""
 
     def __init__(self, settings: AirspaceSettings | None = None) -> None:
         self.settings = settings or AirspaceSettings()
         self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
-        self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space at that time
-        self._sinks = self._blocked = False  # sinking to the ceiling; and whether something is in the way
+        self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space when it was permitted
+        self._sinks = self._blocked = False  # whether it is sinking to the ceiling, and whether something is in the way
         self._newest: Feedback | None = None
-        self._at_ns = 0  # capture time of the newest position, without repeats
-        self._moves = False  # by its last permitted set-point
-        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # each zone's plane from when the vehicle was last outside
-        self._ground: deque[tuple[int, float]] = deque()  # time, and height of the ground in world axes [m]
+        self._at_ns = 0  # capture time of the newest position, not counting repeats
+        self._moves = False  # whether its last permitted set-point makes it move
+        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # each zone's plane when the vehicle was last outside it
+        self._ground: deque[tuple[int, float]] = deque()  # times, and heights of the ground in world axes [m]
 
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
@@ -75,11 +75,11 @@ class Airspace:
 
         Args:
             action: The requested action, with finite numbers.
-            feedback: The newest sample; None: none yet.
-            now_ns: The present time, on the clock of ``feedback.captured_ns`` [ns].
+            feedback: The newest sample; None if there is none yet.
+            now_ns: The current time, on the clock of ``feedback.captured_ns`` [ns].
             new: Whether it is a new request. A permitted target stays permitted while nothing else is requested: if
-                drift brings an obstacle into the straight line, the steps avoid it; a lower ceiling lowers the target.
-            planned: Whether it is part of a route that was checked as a whole, so it may be lowered at first.
+                drift puts an obstacle in the way, the steps avoid it; a lower ceiling lowers the target.
+            planned: Whether it is part of a route that was checked as a whole, and so may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -97,7 +97,7 @@ class Airspace:
         return Verdict(action)
 
     def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Shorten a set-point, or one step towards a target, to what limits and walls allow."""
+        """Reduce a set-point, or a step towards a target, to what limits and walls allow."""
         self.observe(feedback)
         return self._set_point(action, feedback, now_ns)
 
@@ -111,7 +111,7 @@ class Airspace:
         return Verdict(allowed, clamps, enforced=enforced)
 
     def objection(self, action: Position, feedback: Feedback | None, now_ns: int) -> str:
-        """Return what is wrong with a target, whatever the path to it, for people; empty if nothing is."""
+        """Return what is wrong with a target, regardless of the path, as readable text; empty if nothing is."""
         self.observe(feedback)
         if action.problem or feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return action.problem
@@ -119,7 +119,7 @@ class Airspace:
         return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
 
     def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
-        """Return why ``limits.altitude`` must not be this low now: some vehicles sink to it automatically."""
+        """Return why ``limits.altitude`` must not be this low now, as some vehicles descend to it automatically."""
         self.observe(feedback)
         if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
             return ""
@@ -129,16 +129,16 @@ class Airspace:
         return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
 
     def apart(self) -> Airspace:
-        """Return a copy with the same observations, for trial judgements."""
+        """Return a copy with the same observations, for hypothetical requests."""
         other = Airspace(self.settings)
         other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
         other._sides, other._ground = dict(self._sides), self._ground.copy()
         return other
 
     def observe(self, feedback: Feedback | None) -> None:
-        """Note the vehicle's position: its age, the side of each zone that it is on, and the ground below.
+        """Update the vehicle's position: its age, on which side of each zone it is, and the ground below.
 
-        ``jumped_m`` is set if the position changed by more than the vehicle can have flown.
+        ``jumped_m`` is set if the position has changed by more than the vehicle can have flown.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -172,7 +172,7 @@ class Airspace:
             self._ground.clear()
 
     def allowed_speed(self, distance: float, late_s: float) -> float:
-        """Return the maximum speed towards a wall at this distance [m/s]; 0 beyond it."""
+        """Return the maximum speed towards a wall at this distance [m/s]; 0 beyond the wall."""
         deceleration = self.settings.deceleration
         # The positive root of v·t + v²/(2·a) = d.
         lost = deceleration * late_s
@@ -184,7 +184,7 @@ class Airspace:
         """Return the nearest set-point that stays inside the box and outside the zones.
 
         Returns:
-            The set-point, the limits that applied, and whether the position is known; if not, nothing changes.
+            The set-point (unchanged if the position is unknown), the limits that applied, and whether it is known.
         """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
@@ -196,7 +196,7 @@ class Airspace:
         walls = self._walls(feedback.position_m)
         turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
         now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
-        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come nearer since the measurement
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come closer since the measurement
             walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True
@@ -209,7 +209,7 @@ class Airspace:
         walls = [] if space.box is None else list(space.box.walls_inside(at))
         for zone in space.barriers:
             wall = zone.wall_outside(at)
-            # Inside the zone, the nearest plane could be on its far side: keep the one from when it was outside.
+            # Inside a zone, the nearest plane could be on the far side: keep the one from when it was outside.
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
                 wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
@@ -222,7 +222,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
-        # Beyond walls: stop, unless the velocity leads back through at least one of them, and further beyond none.
+        # Beyond walls, stop unless the velocity leads back through at least one of them, and further beyond none.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
@@ -234,7 +234,7 @@ class Airspace:
                 if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
                     most -= min(1.0, BRAKE_GAIN / 4 * excess)
                 if _dot(asked, wall.normal) <= 0.0:
-                    most = max(0.0, most)  # a vehicle that does not ask to go there is not pushed back, either
+                    most = max(0.0, most)  # unless it requests to go there, a vehicle isn't pushed back
                 towards = _dot(wanted, wall.normal)
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
@@ -243,7 +243,7 @@ class Airspace:
             if math.dist(wanted, before) < 1e-6:
                 break
         else:
-            wanted = (0.0, 0.0, 0.0)  # contradicting walls
+            wanted = (0.0, 0.0, 0.0)  # the walls contradict each other
         if not clamps:
             return action, ()
         forward, left = _to_body(wanted[0], wanted[1], turn)
@@ -252,12 +252,12 @@ class Airspace:
     def _attitude(
         self, action: Attitude, walls: list[Wall], turn: tuple[float, float], now: Vec3, late_s: float
     ) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Shorten an attitude. Pitch forward accelerates forward, roll to the right to the right, both by g·tan."""
+        """Reduce an attitude. Pitching forward accelerates forward, rolling right to the right, both by g·tan."""
         ahead, aside = GRAVITY_M_S2 * math.tan(action.pitch), -GRAVITY_M_S2 * math.tan(action.roll)
         east, north, climb = _to_world((ahead, aside, action.climb), turn)
         clamps: dict[str, Clamp] = {}
         deceleration = self.settings.deceleration
-        unseen_s = late_s - self.settings.reaction_s  # time in which it may have become faster
+        unseen_s = late_s - self.settings.reaction_s  # time during which the vehicle may have accelerated
         gaining_s = unseen_s if unseen_s > _BLIND_S else 0.0
         for wall in walls:
             x, y, z = wall.normal
@@ -311,7 +311,7 @@ class Airspace:
         speed, limit = _fastest(at, place, limits)
         if (
             not goes_on and action.speed is not None and action.speed > speed
-        ):  # once: the direction turns near the place
+        ):  # only once, because the direction changes near the target
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
             clamps.append(Clamp("limits.yaw_rate", action.turn_rate, limits.yaw_rate))
@@ -320,7 +320,7 @@ class Airspace:
         return Verdict(fitted, tuple(clamps), enforced=True if space.walled else None)
 
     def _hover(self, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Hover, or first descend from above ``limits.altitude``, as far as nothing is in the way."""
+        """Hover; if above ``limits.altitude``, first descend unless something is in the way."""
         limits = self.settings.limits
         altitude = None if feedback is None else feedback.altitude_m
         above = 0.0 if altitude is None else altitude - limits.altitude
@@ -336,7 +336,7 @@ class Airspace:
         return Verdict(Hover() if self._blocked else sink, clamps, enforced=enforced)
 
     def _takeoff(self, action: Takeoff, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Refuse to take off in a no-fly zone, or into one."""
+        """Refuse to take off inside a no-fly zone, or into one."""
         if feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return Verdict(action)
         x, y, z = feedback.position_m
@@ -345,7 +345,7 @@ class Airspace:
         return _out_of_range(f"the take-off would enter it: {problem}") if problem else Verdict(action)
 
     def _ground_below(self, feedback: Feedback) -> float | None:
-        """Return the recent median height of the ground below the vehicle, in world axes [m]; None: unknown."""
+        """Return the recent median height of the ground below the vehicle, in world axes [m]; None if unknown."""
         if feedback.altitude_m is None or not self._ground:
             return None
         return sorted(height for _, height in self._ground)[len(self._ground) // 2]
@@ -364,11 +364,11 @@ class Airspace:
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """Return the age of the newest position, whether or not it was repeated."""
+        """Return the age of the newest position [s], even if it was repeated."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Return whether the newest position is fresh enough to fly to a target; between walls, speed counts, too."""
+        """Return whether the newest position is fresh enough to fly to a target; between walls, speed matters, too."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)
@@ -392,7 +392,7 @@ def _too_low(z: float, ground: float | None) -> str:
 
 
 def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
-    """Return why the vehicle can't fly to targets now, and what helps; empty if it can."""
+    """Return why the vehicle can't fly to targets now, and what to do about it; empty if it can."""
     if feedback is None or feedback.position_m is None:
         return f"{NO_POSITION}: fly it by velocity, or {POSITION_SOURCES}"
     if feedback.yaw_rad is None:

@@ -1,9 +1,9 @@
 """The authority to command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
 
 Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
-number is unique in this run. A strictly higher priority takes over at once, or after the holder was asked. A pre-empted
-pilot waits in the queue, in order of priority and first arrival. A holder that requested the authority for a limited
-time loses it when that time is over and someone waits. ``docs/proxy.md`` has the rules in words.
+number is unique in this run. A strictly higher priority takes over at once, or after the holder has been asked. A
+pre-empted pilot waits in the queue, which is ordered by priority and first arrival. A holder that requested the
+authority for a limited time loses it once that time is over and the queue isn't empty. See ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from skyloop.clock import nanoseconds
 
 @dataclass(frozen=True, slots=True, order=True)
 class QueueEntry:
-    """An application that holds the authority or waits for it. Sorts in order of service."""
+    """An application that holds the authority or waits for it. Entries sort in the order in which they get it."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of its first request since it last held or requested nothing
+    arrival: int  #: number of its first request since it last neither held nor requested the authority
     app_id: int
-    term_ns: int | None = field(default=None, compare=False)  #: requested duration from the grant; None: unlimited
-    #: Until when the holder is asked before it is pre-empted; None: it is not being asked.
+    term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
+    #: When the holder, which is being asked, will be pre-empted; None if it is not being asked.
     asks_until_ns: int | None = field(default=None, compare=False)
 
     def asks(self, now_ns: int) -> bool:
@@ -32,17 +32,17 @@ class QueueEntry:
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """The authority was given to ``app_id`` under a new lease."""
+    """The authority was granted to ``app_id`` under a new lease."""
 
     app_id: int
     priority: int
     lease: int
-    until_ns: int | None = None  #: end of its time
+    until_ns: int | None = None  #: end of the requested time; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired``: its time is over and others wait."""
+    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` if its time is over and others wait."""
 
     app_id: int
     lease: int
@@ -51,7 +51,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Preempted:
-    """The lease ended for a request of strictly higher priority, or because the holder ``granted`` one.
+    """The lease ended because of a request with strictly higher priority, or because the holder ``granted`` one.
 
     The former holder waits in the queue.
     """
@@ -65,29 +65,29 @@ class Preempted:
 
 @dataclass(frozen=True, slots=True)
 class Queued:
-    """An application waits in the queue, or has moved up; ``position`` 1 is next."""
+    """An application is waiting in the queue, or has moved up; ``position`` 1 is next."""
 
     app_id: int
     priority: int
     position: int
-    wait_ns: int | None = None  #: estimate; None: unknown
+    wait_ns: int | None = None  #: estimated wait; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The holder is asked to hand the authority over."""
+    """The holder is being asked to hand the authority over."""
 
     app_id: int  #: the holder
     lease: int
     by_id: int
     by_priority: int
-    until_ns: int  #: when ``by_id`` wins, if its priority is strictly higher
+    until_ns: int  #: time at which ``by_id`` wins if its priority is strictly higher
     term_ns: int | None = None  #: requested duration
 
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The holder declined to hand it over to ``app_id``, which keeps waiting."""
+    """The holder declined to hand the authority over to ``app_id``, which continues to wait."""
 
     app_id: int
     holder_id: int
@@ -96,7 +96,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """A request to the holder ended: the other application left the queue, or now waits without asking."""
+    """A request to the holder ended, because the other application left the queue or now waits without asking."""
 
     app_id: int  #: the holder
     lease: int
@@ -105,7 +105,7 @@ class Withdrawn:
 
 @dataclass(frozen=True, slots=True)
 class Expired:
-    """The holder's time is over; it keeps the authority until someone requests it. Reported once."""
+    """The holder's time is over, but it keeps the authority until another application requests it. Reported once."""
 
     app_id: int
     lease: int
@@ -115,18 +115,18 @@ Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Withdrawn | Ex
 
 
 class Authority:
-    """The holder of the authority over one vehicle, and the queue. Methods return the changes, in order."""
+    """Keeps track of who holds the authority over one vehicle, and of the queue. Methods return changes in order."""
 
     def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
         self.timeout_ns = nanoseconds(timeout_s)  #: silence after which a holder loses the lease
         self.ask_ns = nanoseconds(ask_s)  #: how long a holder may be asked before the higher priority wins
         self.holder: QueueEntry | None = None
-        self.lease = 0  #: the lease in force; 0 for none
-        self.last_command_ns = 0  #: time of the last valid command of a holder, this one or an earlier one
+        self.lease = 0  #: the lease in force; 0 if there is none
+        self.last_command_ns = 0  #: time of the last valid command from this or an earlier holder
         self._granted_ns = 0  # when the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
         self.silent: QueueEntry | None = (
-            None  #: the last holder if it lost the lease by silence; listed until someone requests the authority
+            None  #: the last holder if it lost the lease by silence; listed until there is a request for the authority
         )
         self._last_lease = 0
         self._arrivals = 0
@@ -136,7 +136,7 @@ class Authority:
 
     @property
     def owner(self) -> QueueEntry | None:
-        """The listed owner: the holder, or a silent former one without a successor."""
+        """The owner shown to clients: the holder, or a former one that fell silent and has no successor."""
         return self.holder or self.silent
 
     @property
@@ -150,15 +150,15 @@ class Authority:
         return self._last_lease
 
     def position(self, app_id: int) -> int:
-        """Return the position in the queue from 1; 0 if the application does not wait."""
+        """Return the position in the queue, starting with 1; 0 if the application is not waiting."""
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
 
     def asking(self, app_id: int, now_ns: int) -> bool:
-        """Return whether this application waits while the holder is asked to hand it over."""
+        """Return whether the holder is being asked to hand the authority over to this application."""
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return a waiting application's expected wait if each keeps to its time; None: someone gave none."""
+        """Return how long an application must wait if all others keep to their times; None if one gave no time."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -186,9 +186,9 @@ class Authority:
     ) -> list[Effect]:
         """Request the authority, or change the priority or the time of an earlier request.
 
-        ``queue`` False: do not wait. ``term_ns``: requested duration; None: until it is given back. ``ask``: ask the
-        holder first. Afterwards the application holds the authority, or has a :meth:`position`, or was refused because
-        a holder has at least the same priority.
+        ``queue``: whether to wait in the queue. ``term_ns``: requested duration; None: until released. ``ask``: whether
+        to ask the holder first. Afterwards the application holds the authority, has a :meth:`position`, or has been
+        refused because a holder has at least the same priority.
         """
         effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
@@ -196,7 +196,7 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # it must request it again, like all others
+            effects.append(self._relieve())  # it must request the authority again, like all others
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
@@ -216,10 +216,10 @@ class Authority:
         return effects
 
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
-        """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` does not ask.
+        """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` has not asked.
 
-        Granting means stepping back: the first in the queue gets it, and the holder waits, with at most that one's
-        priority. Declining is reported; a strictly higher priority still wins when the time to ask is over.
+        If the answer grants it, the first in the queue gets the authority, and the holder waits with at most the same
+        priority. A refusal is reported; a strictly higher priority still wins once the time for asking is over.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -242,8 +242,8 @@ class Authority:
     def update(self, now_ns: int) -> list[Effect]:
         """Apply changes due by time; call at a steady pace.
 
-        A silent holder's lease ends, and so does that of a holder whose time is over while others wait. A holder that
-        was asked for long enough is pre-empted.
+        The lease of a silent holder ends, and so does that of a holder whose time is over while others wait. A holder
+        that has been asked for long enough is pre-empted.
         """
         holder = self.holder
         if holder is None:
@@ -254,13 +254,13 @@ class Authority:
                 self.silent = holder
             return effects
         effects = self._settle(now_ns)
-        if self._is_over(now_ns) and not self._expiry_reported:  # no one waits, or it would have been relieved
+        if self._is_over(now_ns) and not self._expiry_reported:  # the queue is empty, or it would have been relieved
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects
 
     def slept(self, ns: int) -> None:
-        """Age everything by this time: the computer slept, and its clock stopped."""
+        """Make everything older by this time, during which the computer slept and its clock stopped."""
         self.last_command_ns -= ns
         self._granted_ns -= ns
         if self.until_ns is not None:
@@ -271,7 +271,7 @@ class Authority:
     def _dequeue(
         self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
     ) -> tuple[QueueEntry, bool]:
-        """Take the application's entry out of the queue; return it, and whether the holder was being asked."""
+        """Remove the application's entry from the queue; return it, and whether the holder was being asked."""
         known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
         asked_before = known is not None and known.asks(now_ns)
         if known is not None:
@@ -294,7 +294,7 @@ class Authority:
         return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
 
     def _change_term(self, term_ns: int | None, now_ns: int) -> None:
-        """Set the holder's remaining time, without extending it while others wait. None: keep it."""
+        """Set the holder's remaining time, which can't be extended while others wait. None leaves it unchanged."""
         if term_ns is None:
             return
         until_ns = now_ns + term_ns
@@ -305,7 +305,7 @@ class Authority:
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
         """Give the authority to the first in the queue; the holder waits.
 
-        The holder keeps its remaining time, but gets at most the new holder's priority, or it would win it back.
+        The holder keeps its remaining time, but gets at most the new holder's priority, or it would win again at once.
         """
         holder, lease = self.holder, self.lease
         assert holder is not None
@@ -344,7 +344,7 @@ class Authority:
     def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first in the queue if due.
 
-        It is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
+        This is due if there is no holder, its time is over, or an entry with strictly higher priority need not wait.
         """
         effects: list[Effect] = []
         holder = self.holder

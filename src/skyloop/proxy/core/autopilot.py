@@ -1,11 +1,11 @@
 """The software autopilot: take-off, hover, land, velocity and position for vehicles that lack them. Pure.
 
-Also the return to where the vehicle took off, for all vehicles: a series of targets, each judged as for ``go_to``
-(:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start, and a landing
-or hover there. Both are stepped from outside. ``docs/proxy.md`` has the rules of the return in words.
+It also handles the return to where the vehicle took off, for all vehicles. This is a series of targets, each judged as
+for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start,
+and a landing or hover there. Both are stepped by the caller. ``docs/proxy.md`` describes the rules of the return.
 
 A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
-a velocity loop (proportional and integral, the common cascade of small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
+a velocity loop (proportional and integral, the usual cascade for small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
 "Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103: to accelerate
 forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down: negative roll.
 """
@@ -37,27 +37,27 @@ from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.proxy.core.settings import AutopilotSettings, Clamp, ReturnSettings
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: the pace that it is designed for
-ALTITUDE_GAIN: Final = 1.0  #: climb per metre of altitude error [1/s]
+PERIOD_S: Final = 0.02  #: period of the steps that it is designed for
+ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
-POSITION_SPEED: Final = 0.5  #: maximum in a hover [m/s]
-GO_GAIN: Final = 0.9  #: on the way to a target: speed per remaining metre [1/s]
-GO_SPEED: Final = 1.0  #: maximum if none is given [m/s]
-GO_DECELERATION: Final = 0.6  #: towards the target [m/s²]
+POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
+GO_GAIN: Final = 0.9  #: speed per remaining metre on the way to a target [1/s]
+GO_SPEED: Final = 1.0  #: maximum speed on the way to a target if none is given [m/s]
+GO_DECELERATION: Final = 0.6  #: deceleration towards the target [m/s²]
 TURN_GAIN: Final = 1.5  #: yaw rate per remaining radian [1/s]
-TURN_RATE: Final = 1.2  #: maximum if none is given [rad/s]
-SETTLED_SPEED: Final = 0.2  #: a hover fixes its position once slower than this [m/s]
+TURN_RATE: Final = 1.2  #: maximum yaw rate if none is given [rad/s]
+SETTLED_SPEED: Final = 0.2  #: speed below which a hover fixes its position [m/s]
 ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
 LONGEST_RISE: Final = 2.0  #: a take-off ends after this multiple of its nominal duration, ...
 LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
 # Return flight:
-NEAR_M: Final = 0.3  #: this close, and at rest, it has arrived
-CLOSE_M: Final = 1.0  #: close enough if it gets no closer
+NEAR_M: Final = 0.3  #: a vehicle this close, and at rest, has arrived
+CLOSE_M: Final = 1.0  #: close enough if the vehicle gets no closer
 AT_REST_M_S: Final = 0.3
-HEADWAY_M: Final = 0.2  #: a leg that does not become shorter by this ...
-STALL_NS: Final = 10 * NS_PER_S  #: ... within this time leads nowhere
-#: How long a failsafe tolerates obstacles to a return before it lands the vehicle in place.
+HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this ...
+STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
+#: How long a failsafe tolerates something that prevents a return before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
 CLEARANCE_M: Final = 0.3  #: distance to the ceiling of the room and to the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -66,7 +66,7 @@ SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position",
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:
-    """Return the actions that the autopilot adds to a vehicle's own."""
+    """Return the actions that the autopilot adds to a vehicle's native ones."""
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
@@ -93,7 +93,7 @@ _STATES: Final = {
 
 
 class Autopilot:
-    """Flies one vehicle in software; reports its task to ``flight``, which decides when the task has ended."""
+    """Flies one vehicle in software; ``flight`` is informed of the current task and decides when it has ended."""
 
     def __init__(
         self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None
@@ -101,16 +101,16 @@ class Autopilot:
         self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
-        self.drifts = False  #: the vehicle is held level because its velocity is unknown: nothing brakes it
-        #: Returns the permitted velocity for a desired one, by the newest feedback; not called during a landing.
+        self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
+        #: Returns the permitted velocity for a desired one, given the newest feedback; not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
-        self._integral = (0.0, 0.0)  # forward, left [rad]
+        self._integral = (0.0, 0.0)  # integrals forward and left [rad]
         self._stepped_ns: int | None = None
         self._lifted_ns: int | None = None  # when the take-off left the ground
-        self._from_height: float | None = None  # height of its position at that time [m]
-        self._altitudes: set[float] = set()  # lowest and highest reading since then [m]
+        self._from_height: float | None = None  # height according to its position at that time [m]
+        self._altitudes: set[float] = set()  # lowest and highest readings since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
         self._hold_yaw: float | None = None
@@ -122,7 +122,7 @@ class Autopilot:
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
-                self._hold_yaw = None  # keep the yaw it has reached from here on, not the earlier one
+                self._hold_yaw = None  # from now on, keep the yaw reached so far, not the earlier one
             self._target = action
         if mode is self.mode:
             return
@@ -134,25 +134,25 @@ class Autopilot:
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
 
     def stop(self, action_name: str) -> None:
-        """Stop steering: the vehicle itself executes something now."""
+        """Stop steering, because the vehicle itself is executing an action now."""
         self.mode = Mode.OFF
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
-        """Stop moving: the vehicle failed to execute the action that was to replace this task."""
+        """Stop moving, because the vehicle failed to execute the action that was to replace this task."""
         if isinstance(self._target, Position) and self._target.yaw is not None:
-            self._hold_yaw = None  # as in `start`: keep the yaw that it has reached
+            self._hold_yaw = None  # keep the yaw reached so far, as in `start`
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
-        """Handle the vehicle's refusal of a set-point: a take-off is over if the vehicle ``reported`` to stand."""
+        """Handle the vehicle's refusal of a set-point; a take-off is over if the vehicle ``reported`` being landed."""
         if self.flight.refused(reported):
             self.mode = Mode.OFF
 
     def step(
         self, now_ns: int, feedback: Feedback | None, reported: FlightState = FlightState.UNKNOWN
     ) -> Attitude | Velocity | None:
-        """Return the set-point to send now; None while off. Call every :data:`PERIOD_S`.
+        """Return the set-point to send now; None while the autopilot is off. Call every :data:`PERIOD_S`.
 
         ``reported``: the flight state from the driver, which may differ from that in ``feedback``.
         """
@@ -184,7 +184,7 @@ class Autopilot:
         return self._target
 
     def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
-        """Climb until the altimeter (otherwise the position, or the time) shows enough height."""
+        """Climb until the altimeter (failing that, the position, or the time) indicates enough height."""
         settings = self.settings
         altitude = known.altitude_m if known is not None else None
         height = known.position_m[2] if known is not None and known.position_m is not None else None
@@ -203,8 +203,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter always reads the same. One that moves, but shows the vehicle on the ground when the time is
-        # over, is right: the motors turn without lift-off, as seen with a real Betaflight on a slow computer.
+        # A stuck altimeter always reads the same. If its readings change, but show the vehicle on the ground when time
+        # is up, they are right: the motors turn without lifting off, as seen with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
@@ -215,7 +215,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # it may be anywhere when it is next received: hold that position
+        if known is None:  # it may be anywhere when it is next received, and will hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -236,7 +236,7 @@ class Autopilot:
         return Velocity(forward, left, up)
 
     def _go(self, target: Position, known: Feedback | None) -> Velocity:
-        """Fly straight towards a target, slower near it; at zero speed while position or yaw is unknown."""
+        """Fly straight to a target, more slowly near it; stop while the position or yaw is unknown."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
         if self._hold_yaw is None:
@@ -256,7 +256,7 @@ class Autopilot:
         )
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
-        """Return the roll and pitch [rad] to reach a velocity; level while the velocity is unknown."""
+        """Return the roll and pitch [rad] for reaching a velocity; level while the velocity is unknown."""
         self.drifts = known is None or known.velocity_m_s is None
         if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
@@ -269,7 +269,7 @@ class Autopilot:
         )
         forward = settings.velocity_p * forward_error + integral[0]
         left = settings.velocity_p * left_error + integral[1]
-        if math.hypot(forward, left) <= settings.tilt:  # only then: the integral would wind up
+        if math.hypot(forward, left) <= settings.tilt:  # otherwise the integral would wind up
             self._integral = integral
         else:
             forward, left = _shorten(forward, left, settings.tilt)
@@ -294,17 +294,17 @@ def _shorten(x: float, y: float, most: float) -> tuple[float, float]:
 
 
 class StartPoint:
-    """The place where the vehicle last left the ground, in world axes."""
+    """Keeps the position where the vehicle last left the ground, in world axes."""
 
     def __init__(self) -> None:
-        self.position: Vec3 | None = None  #: [m]; None: unknown
+        self.position: Vec3 | None = None  #: the position [m]; None if unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # since when it has been standing; None: it is not
-        self._flew = False  # it has been seen in the air
-        self._open = False  # it is taking off, and its position is still awaited
+        self._standing_ns: int | None = None  # when it began to be on the ground; None if it isn't
+        self._flew = False  # whether it has been seen in the air
+        self._open = False  # whether it is taking off, with its position not known yet
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
-        """Observe the vehicle; a brief false "landed" in the air does not move the start."""
+        """Observe the vehicle; if it briefly reports "landed" while in the air, the start does not change."""
         before, self._state = self._state, state
         if state in _GROUNDED:
             if self._standing_ns is None:
@@ -328,18 +328,18 @@ class StartPoint:
 
 
 class ReturnDecision(NamedTuple):
-    """The vehicle's next step of a return."""
+    """The decision on the next step of a return."""
 
-    action: Position | Land | None = None  #: None: it must stop
+    action: Position | Land | None = None  #: the vehicle's next action; None if it must stop
     clamps: tuple[Clamp, ...] = ()
-    refusal: Refusal | None = None  #: None without an action: it continues with the next fresh position
-    why: str = ""  #: reason of the refusal, for people
-    lasting: bool = False  #: waiting for a fresh position does not help
-    enforced: bool | None = None  #: whether the safety box and zones were enforced; None: there are none, or no target
+    refusal: Refusal | None = None  #: None if there is no action either: it continues at the next fresh position
+    why: str = ""  #: readable reason for the refusal
+    lasting: bool = False  #: whether it is pointless to wait for a fresh position
+    enforced: bool | None = None  #: whether safety box and zones were enforced; None if there are none, or no target
 
 
 class ReturnFlight:
-    """One flight back to the start; ``settings`` fill in what the action leaves open."""
+    """One flight back to the start; ``settings`` provide what the action does not specify."""
 
     def __init__(self, action: ReturnToStart, start: Vec3 | None, settings: ReturnSettings) -> None:
         self.phase = ReturnPhase.NONE
@@ -349,9 +349,9 @@ class ReturnFlight:
         self._speed = settings.speed
         self._land = settings.land if action.land is None else action.land
         self._target: Vec3 = (0.0, 0.0, 0.0)
-        self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered under a lower ceiling
+        self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered if the ceiling is lower
         self._over: Vec3 = (0.0, 0.0, 0.0)  # the point above the start
-        self._left_m, self._left_ns = math.inf, 0  # the shortest remaining distance, and since when
+        self._left_m, self._left_ns = math.inf, 0  # the shortest remaining distance so far, and when it was reached
         self._stepped_ns = 0
 
     def step(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
@@ -361,7 +361,7 @@ class ReturnFlight:
             airspace.observe(feedback)
             problem = self._plan(airspace, feedback, now_ns)
             if problem is not None:
-                self.phase = ReturnPhase.NONE  # everything is checked again before it continues
+                self.phase = ReturnPhase.NONE  # everything is checked again before continuing
                 return problem
         if self.phase is ReturnPhase.LANDING:
             return ReturnDecision(Land())
@@ -389,7 +389,7 @@ class ReturnFlight:
         return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, problem, True) if problem else None
 
     def _begin(self, start: Vec3, airspace: Airspace, feedback: Feedback, at: Vec3) -> str:
-        """Plan the whole return; return what is in the way, for people."""
+        """Plan the whole return; return what is in the way, as readable text."""
         space = airspace.settings.space
         top = max(at[2], start[2] + self._height) if math.dist(at[:2], start[:2]) >= CLOSE_M else at[2]
         top = min(top, airspace.ceiling(feedback))
@@ -397,7 +397,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # From outside the box, or inside a zone, it does not climb first: the straight line leads back inside.
+        # If outside the box or inside a zone, don't climb first, because the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:
@@ -413,7 +413,7 @@ class ReturnFlight:
         return ""
 
     def _go_on(self, feedback: Feedback, at: Vec3, now_ns: int) -> str:
-        """Start the next leg when the current one is over; return an objection for people, if any."""
+        """Start the next leg when the current one is over; return an objection, if any, as readable text."""
         left_m = math.dist(at, self._flown)
         paused, self._stepped_ns = now_ns - self._stepped_ns > NS_PER_S, now_ns
         if paused or left_m < self._left_m - HEADWAY_M:
@@ -422,7 +422,7 @@ class ReturnFlight:
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
                 self.phase, self._left_m = ReturnPhase.FLYING, math.inf
-                self._target = self._flown = self._over  # the straight line to it is judged together with it
+                self._target = self._flown = self._over  # judged together with the straight line to it
                 return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S

@@ -1,12 +1,12 @@
-"""An application's intents, from start to end, and the checks that each command passes. Pure.
+"""Track an application's intents from start to end, and check each command. Pure.
 
 The library repeats each command many times a second. A repeat refers to its intent: it is judged again while the intent
-is in progress, and never acts once it is over. :data:`skyloop.messages.command.ENDINGS` lists everything that ends one.
+is in progress, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends one.
 
 The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
 whether a command is a sign of life of the holder); then whether its intent is in progress, the vehicle link, support,
-whose flight it is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). ``docs/proxy.md`` has
-the rules in words.
+whose flight it is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). ``docs/proxy.md``
+describes the rules.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
-MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be: the error of the clock offset
-TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground by then ends, and is withdrawn
-#: A landing that withdrew a take-off is done once the vehicle has stood this long: an arming may have been on its way.
+MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
+TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn
+#: A landing that withdrew a take-off is done after this time on the ground, because arming may have been in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
-_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: their repeats need no explanation
+_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates whose repeats are refused without explanation
 _LANDINGS: Final = (Land, ReturnToStart)
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: the next repeat may succeed
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: after these, the next repeat may succeed
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
-_TAKING: Final = (Takeoff, Hover, Land)  #: as new requests, they take over a vehicle that others fly
+_TAKING: Final = (Takeoff, Hover, Land)  #: actions that, as new requests, take over a vehicle flown by others
 
 
 @dataclass(slots=True)
@@ -68,21 +68,21 @@ class Intent:
     number: int
     action: AnyAction
     asked_ns: int
-    state: FlightState  #: the vehicle's state at the request, or at the last observation
+    state: FlightState  #: the vehicle's state when it was requested, or last observed
     fate: Fate = Fate.UNDER_WAY
-    begun: bool = False  #: the vehicle has started to execute it
-    automatic: bool = False  #: requested by the library itself
+    begun: bool = False  #: whether the vehicle has started to execute it
+    automatic: bool = False  #: whether the library itself requested it
     withdrew: bool = False  #: whether it ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
 
     @property
     def over(self) -> bool:
-        """Whether it has ended; then no repeat acts."""
+        """Whether it has ended, so that repeats have no effect."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End it unless it has already ended. ``text`` and ``reason``: the answer to its repeats."""
+        """End it unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
@@ -92,8 +92,8 @@ class Intent:
     def refuse(self, reason: Refusal, why: str) -> None:
         """End it with a refusal.
 
-        A hover and a landing stay in progress if only the driver failed or the link is lost, as nothing is safer; a
-        reset always does, because the emergency may not be known yet. They count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. Resets
+        always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -101,7 +101,7 @@ class Intent:
             self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
-        """End or complete it by the vehicle's state; ``shown_ns``: the time of that state, None for now."""
+        """End or complete it according to the vehicle's state; ``shown_ns``: the time of that state, None for now."""
         before = self.state
         if state is not FlightState.UNKNOWN:  # an unknown state does not replace a known one
             self.state = state
@@ -110,7 +110,7 @@ class Intent:
         kind = type(self.action)
         if state is FlightState.LANDED:
             if kind is Land:
-                # That the vehicle stood before the request proves nothing: it may be in the air by now.
+                # The vehicle having been on the ground before the request proves nothing: it may be in the air by now.
                 shown = shown_ns is None or shown_ns >= self.asked_ns
                 if shown and (not self.withdrew or now_ns - self.asked_ns >= SETTLED_NS):
                     self.end(Fate.COMPLETED)
@@ -130,11 +130,11 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """Return its outcome for feedback. ``name``: the application's; ``state``: the vehicle's in that feedback.
+        """Return its outcome for feedback, given the application's name and the vehicle's state in that feedback.
 
-        Nothing for a take-off that has just risen into the air: others may have taken the vehicle on its way up.
+        A take-off that has just left the ground has no outcome yet: others may have taken the vehicle on its way up.
         """
-        fate = self.fate  # first, because another thread may end it now
+        fate = self.fate  # read first, because another thread may end it now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -152,16 +152,17 @@ class Intents:
     __slots__ = ("_ended", "_floor", "_received", "newest", "seq")
 
     def __init__(self) -> None:
-        self.seq = -1  #: of the newest command received
+        self.seq = -1  #: sequence number of the newest command received
         self.newest = NO_INTENT
-        self._received = 0  # highest number, refused commands included
-        self._floor = -1  # intents up to this one precede an event that ended them,
-        self._ended = Fate.AUTHORITY  # which was this
+        self._received = 0  # highest intent received, including refused commands
+        self._floor = -1  # intents up to this one were ended by an event
+        self._ended = Fate.AUTHORITY  # the fate that this event caused
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
 
-        ``lease``: the one in force (0 for none); ``holds``: whether the sender holds it. None: a sign of life.
+        ``lease``: the lease in force (0 if there is none); ``holds``: whether the sender holds it. Returns None if the
+        command counts as a sign of life.
         """
         if command.seq <= self.seq:
             return Refusal.OUT_OF_SEQUENCE
@@ -192,11 +193,11 @@ class Intents:
 
     @property
     def lands(self) -> bool:
-        """Whether a landing in place was requested and is in progress."""
+        """Whether a requested landing in place is in progress."""
         return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
-        """Handle an emergency stop, which is executed whatever its sequence: all requests end."""
+        """Handle an emergency stop, which is executed regardless of its sequence number and ends all requests."""
         assert type(command.action) is EmergencyStop
         self.seq, self._received = max(self.seq, command.seq), max(self._received, command.intent)
         self.end(Fate.EMERGENCY)
@@ -208,11 +209,11 @@ class Intents:
 
 
 class StatePolicy(Enum):
-    """How an action is handled in a flight state."""
+    """How to handle an action in a given flight state."""
 
     APPLY = auto()
-    HOLD = auto()  #: accepted without effect: the state is already reached, or a manoeuvre continues
-    HOVER = auto()  #: a take-off of a flying vehicle: hover
+    HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
+    HOVER = auto()  #: hover instead, for a take-off in flight
     REFUSE = auto()
 
 
@@ -224,7 +225,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: In an unknown state, everything is passed on: some vehicles never report it.
+#: If the state is unknown, everything is passed on, because some vehicles never report it.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -239,21 +240,21 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
 
 
 class Decision(NamedTuple):
-    """The decision about a command that passed the first checks."""
+    """The decision on a command that passed the first checks."""
 
-    action: AnyAction | None = None  #: the vehicle's new action; None: nothing new. With a refusal: the substitute
+    action: AnyAction | None = None  #: the vehicle's new action (a substitute if refused); None if there is none
     refusal: Refusal | None = None
-    why: str = ""  #: reason of the refusal, for people
+    why: str = ""  #: readable reason for the refusal
     takes_off: bool = False
-    clamps: tuple[Clamp, ...] = ()  #: the limits that shortened it
-    enforced: bool | None = None  #: whether box and zones could be enforced; None: there are none, or no set-point
+    clamps: tuple[Clamp, ...] = ()  #: the limits that reduced it
+    enforced: bool | None = None  #: whether box and zones could be enforced; None if there are none, or no set-point
 
 
 class CommandChecks:
-    """Decides what happens to the commands for one vehicle.
+    """Decides how to handle the commands for one vehicle.
 
     ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
-    ``why_not``: why others are missing, for people.
+    ``why_not``: why others are not available, as readable text.
     """
 
     def __init__(
@@ -269,15 +270,15 @@ class CommandChecks:
         self.airspace = Airspace()
         self.returns = ReturnSettings()
         self.start = StartPoint()
-        self.way_back: ReturnFlight | None = None  #: the return in progress; None: none was requested
+        self.way_back: ReturnFlight | None = None  #: the return in progress; None if none was requested
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: What a person may command while the vehicle is not received: it may still receive us, and otherwise only the
-        #: emergency stop would be left to bring it down.
+        #: What a person may command while nothing is received from the vehicle: it may still receive us, and otherwise
+        #: only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
@@ -293,9 +294,9 @@ class CommandChecks:
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide about a command whose intent is in progress, other than an emergency stop or idle.
+        """Decide on a command whose intent is in progress, other than an emergency stop or idle.
 
-        ``new``: a new request of the application; otherwise a repeat, or the library's own request (``automatic``).
+        ``new``: whether it is the application's new request, not a repeat or the library's own (``automatic``).
         """
         now_ns, state, feedback, link, _ = seen
         kind = type(action)
@@ -303,21 +304,21 @@ class CommandChecks:
         if new and kind is ReturnToStart:
             self.way_back = None
         if automatic and (state is FlightState.LANDING or self.goes_on(kind, seen, automatic=True)):
-            policy = StatePolicy.HOLD  # it is already landing, and no automatic hover aborts that
+            policy = StatePolicy.HOLD  # it is already landing, which an automatic hover does not abort
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
-            policy = StatePolicy.APPLY  # landing or standing is old news: it may have received something else since
+            policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
         if lands and is_set_point and not self.goes_on(kind, seen, automatic=automatic):
-            policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a returning pilot aborts it
+            policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         if policy is StatePolicy.HOLD:
             if type(action) is Position and (why := self.airspace.objection(action, feedback, now_ns)):
-                return Decision(None, Refusal.OUT_OF_RANGE, why)  # after the take-off it would be too late
+                return Decision(None, Refusal.OUT_OF_RANGE, why)  # after taking off, it would be too late
             return Decision()
         if type(action) is ReturnToStart and policy is not StatePolicy.HOVER:
             if self.way_back is None:
@@ -329,16 +330,16 @@ class CommandChecks:
         action = _HOVER_ACTION if policy is StatePolicy.HOVER else action
         if self._is_judged(action, state):
             verdict = self.airspace.judge(action, feedback, now_ns, new=not intent.begun)
-            if verdict.action is None:  # the previous target is no longer wanted, either
+            if verdict.action is None:  # the previous target isn't wanted any more, either
                 instead = _HOVER_ACTION if is_set_point and Hover in self._supported else None
-                return Decision(instead, verdict.refusal, verdict.why)  # no refusal: wait for a position
+                return Decision(instead, verdict.refusal, verdict.why)  # without a refusal, it waits for a position
         else:
             verdict = Verdict(action)
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def goes_on(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
-        """Return whether the ladder's task continues beside an executed command of the holder, rather than ending."""
+        """Return whether the ladder's task continues, rather than ends, when the holder's command is executed."""
         ladder = self._ladder
         if automatic:
             return ladder.continues_landing or ladder.step is Failsafe.LAND
@@ -357,7 +358,7 @@ class CommandChecks:
         self.way_back = ReturnFlight(action, self.start.position, self.returns)
 
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
-        """Decide the next step of the return."""
+        """Decide on the next step of the return."""
         assert self.way_back is not None
         return self.way_back.step(self.airspace, feedback, now_ns)
 
@@ -370,7 +371,7 @@ class CommandChecks:
     def _problem(
         self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
-        """Return what forbids a command of the holder, whatever the policy of the flight state."""
+        """Return what forbids a command from the holder, regardless of the policy for the flight state."""
         state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic
@@ -401,7 +402,7 @@ class CommandChecks:
 
 
 def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:
-    """Return why :meth:`Intents.check` refused a command, and what would be right, for people."""
+    """Return why :meth:`Intents.check` refused a command, and what would be right, as readable text."""
     if reason is Refusal.OUT_OF_SEQUENCE:
         return f"number {command.seq} is not newer than {newest_seq}, the last one received"
     if reason is Refusal.STALE:

@@ -1,7 +1,7 @@
-"""The failsafe ladder: when a flying vehicle without a pilot hovers, and when it lands. Pure: time is an argument.
+"""The failsafe ladder, which decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
 
-Steps escalate automatically (none, hover, land), and end only with a fresh command or on the ground. The landing may
-follow a flight back to the start, if parameters demand that and nothing prevents it. ``docs/proxy.md`` has the rules.
+Steps escalate automatically (none, hover, land), and end only with a fresh command or on the ground. The vehicle may
+first fly back to its start, if parameters require that and nothing prevents it. ``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 from skyloop.proxy.core.settings import FailsafeSettings
 
-#: A battery must rise this far above a level before another fall below it counts.
+#: The charge must rise this far above a level before falling below it counts again.
 BATTERY_REARM: Final = 0.05
 
-#: Reasons of steps, in words for people.
+#: Reasons for steps, as readable text.
 REASONS: Final = {
     "silent": "the pilot is silent",
     "gone": "the pilot's connection ended",
@@ -33,11 +33,11 @@ REASONS: Final = {
 _RANK: Final = {Failsafe.NONE: 0, Failsafe.HOVER: 1, Failsafe.LAND: 2}
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
 _LAND_AT_START: Final = ReturnToStart(land=True)
-#: States that show that an action accepted by the driver did not reach the vehicle.
+#: States that prove that an action accepted by the driver did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
-    ReturnToStart: frozenset(),  # it is steered all the way
+    ReturnToStart: frozenset(),  # the return is steered all the way
 }
 
 
@@ -46,27 +46,27 @@ FailsafeTask = Hover | Land | ReturnToStart
 
 @dataclass(frozen=True, slots=True)
 class FailsafeInputs:
-    """Inputs of the ladder's decisions."""
+    """Inputs for the ladder's decisions."""
 
     state: FlightState
     airborne: bool
-    last_command_ns: int  #: when the last valid command arrived, from whichever holder
+    last_command_ns: int  #: when the last valid command arrived from any holder
     pilot: str  #: ``held``, or why there is no holder: ``released``, ``silent``, ``gone``, ``expired``, ``none``
-    link_up: bool  #: the hop proxy–vehicle
+    link_up: bool  #: whether the link from proxy to vehicle is up
     battery: float | None
-    ours: bool = True  #: the flight was started, or taken over, by an application of this proxy
-    return_problem: str = ""  #: why the vehicle can't return to its start, for people; empty if it can, or need not
-    shown: bool = True  #: the state is current; False: last shown by a vehicle that is no longer received
+    ours: bool = True  #: whether an application of this proxy started the flight or took it over
+    return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
+    shown: bool = True  #: whether the state is current; False: the last one from a vehicle that is no longer received
 
 
 @dataclass(frozen=True, slots=True)
 class StepChange:
-    """The beginning or end of a step, to be published."""
+    """A step that began or ended, to be published."""
 
     step: Failsafe
     reason: str
-    returns: bool = False  #: it lands at its start, after a flight back there
-    why: str = ""  #: why it does not return although it should, for people
+    returns: bool = False  #: whether it flies back and lands at its start
+    why: str = ""  #: readable reason why it does not return although it should
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +89,9 @@ Effect = StepChange | BatteryLow | FailsafeAction
 def due(
     now_ns: int, inputs: FailsafeInputs, settings: FailsafeSettings, *, barred: str, battery_low: bool
 ) -> tuple[Failsafe, str]:
-    """Return the step that is due for a flight of ours, and the reason, by time, battery and link.
+    """Return the step that is due for our own flight, and the reason, according to time, battery and link.
 
-    ``battery_low``: the charge is below that for a return, and the pilot has not overruled it.
+    ``battery_low``: whether the charge is too low to continue without a return, and the pilot has not overruled that.
     """
     if barred:
         return Failsafe.LAND, barred
@@ -101,7 +101,7 @@ def due(
     silence = "silent" if inputs.pilot == "held" else inputs.pilot
     if silent_ns >= settings.land_after_s * NS_PER_S:
         return Failsafe.LAND, silence
-    if inputs.state is FlightState.LANDING:  # ending a landing is better than hovering above the place
+    if inputs.state is FlightState.LANDING:  # completing a landing is better than hovering above the spot
         return Failsafe.NONE, ""
     if silent_ns >= settings.hover_after_s * NS_PER_S or inputs.pilot == "gone":
         return Failsafe.HOVER, silence
@@ -120,10 +120,10 @@ class FailsafeLadder:
         self.barred = ""  #: why set-points are refused at present: ``battery``, ``closing``, or empty
         self._closing = False
         self._warned = False
-        self.battery_low = False  #: the charge is below that for a return, and has not recovered
-        self._overruled = False  # the pilot has overruled a return for the battery, and flies on
+        self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
+        self._overruled = False  # whether the pilot has overruled a return because of the battery
         self._wanted: FailsafeTask | None = None
-        self.given_up = False  #: a hover or a pilot's landing was abandoned; a silent vehicle may still execute it
+        self.given_up = False  #: an abandoned hover or pilot's landing may still be executed by a silent vehicle
         self.wanted_ns = 0  #: when its current task began
         self._taken = False
         self._next_try_ns = 0
@@ -135,11 +135,11 @@ class FailsafeLadder:
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # hands off a flight of others, whatever its problems
+        if not inputs.ours:  # leave a flight of others alone, whatever its problems
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
-        told = inputs  # the driver may not show a pilot's continued landing yet
+        told = inputs  # the driver may not report a pilot's continued landing yet
         if isinstance(self._wanted, Land) or self.given_up:  # only a landing can follow
             told = replace(inputs, state=FlightState.LANDING)
         step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
@@ -155,7 +155,7 @@ class FailsafeLadder:
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
-        """End the step for a fresh command of the pilot, unless the vehicle lands for a lasting reason."""
+        """End the step after a fresh command from the pilot, unless the vehicle lands for a lasting reason."""
         if self.barred:
             return []
         self._overruled |= self.lands_for_battery
@@ -174,7 +174,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery: only a pilot's decision ends it, not a set-point."""
+        """Whether it returns or lands because of a low battery, which ends by a pilot's decision, not a set-point."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
@@ -189,7 +189,7 @@ class FailsafeLadder:
 
     @property
     def lands(self) -> bool:
-        """Whether it makes the vehicle land, here or at its start, whoever requested that."""
+        """Whether it makes the vehicle land, here or at its start, no matter who requested that."""
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:
@@ -203,11 +203,11 @@ class FailsafeLadder:
         return self._wanted is not None
 
     def give_up(self) -> None:
-        """Abandon a hover or a pilot's landing; only a silent pilot makes a silent vehicle land."""
+        """Abandon a hover or a pilot's landing; a silent vehicle is made to land only if its pilot is silent, too."""
         self._wanted, self.given_up = None, True
 
     def order_landing(self) -> None:
-        """Land because the proxy is about to end; from now on only landing and emergency stop are accepted."""
+        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted."""
         self._closing = True
         self.barred = "closing"
 
@@ -236,7 +236,7 @@ class FailsafeLadder:
         return []
 
     def _should_return(self, reason: str) -> bool:
-        """Return whether a landing for this reason should be one at the start."""
+        """Return whether a landing for this reason should take place at the start."""
         return not self.barred and (reason == "battery_return" or self.settings.returns)
 
     def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:
@@ -262,7 +262,7 @@ class FailsafeLadder:
             return []
         if self._taken and state not in _CONTRADICTIONS[type(wanted)]:
             return []
-        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these end safely without it
+        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these manoeuvres end safely without it
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []

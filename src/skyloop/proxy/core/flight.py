@@ -1,8 +1,8 @@
-"""One flight: whether the vehicle flies, whose flight it is, and how sure both are. Pure: the time is an argument.
+"""Track one flight: whether the vehicle flies, whose flight it is, how certain both are. Pure: time is an argument.
 
 The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
-mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle shows it,
-not by time alone. ``docs/proxy.md`` has the rules in words.
+mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
+it, never because of time alone. ``docs/proxy.md`` describes the rules.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from skyloop.messages import (
     Velocity,
 )
 
-#: A requested take-off that does not show within this time is no longer ours: drivers give up sooner.
+#: A requested take-off that has no visible effect within this time is no longer ours; drivers give up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
-#: A cancelled take-off shows within this time if the vehicle rises nevertheless.
+#: If the vehicle rises in spite of a cancelled take-off, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over when the vehicle has been standing this long: bounces and brief false reports don't end it.
+#: A flight is over when the vehicle has been on the ground for this long, not after bounces or brief false reports.
 STANDING_NS: Final = nanoseconds(1.0)
-#: How long an unobserved flight counts as this proxy's; after that, it may be another one.
+#: How long a flight that can't be observed counts as this proxy's; after that, it may be a different one.
 BELIEF_NS: Final = nanoseconds(60.0)
-STALE_NS: Final = NS_PER_S // 2  #: older feedback shows nothing
-AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle first seen above it that reports no state counts as flying [m]
-STALL_ALTITUDE: Final = 0.5  #: below it, a descent that makes no headway has reached the ground [m]
+STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
+AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this [m]
+STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent that makes no progress has reached the ground [m]
 STALL_NS: Final = NS_PER_S
-STALL_HEADWAY: Final = 0.02  #: [m]
-BLIND_NS: Final = 15 * NS_PER_S  #: a landing without any sensor evidence has an unknown result after this time
+STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
+BLIND_NS: Final = 15 * NS_PER_S  #: duration after which the result of a landing without sensor data is unknown
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
@@ -50,23 +50,23 @@ class Whose(Enum):
     """Who started the flight, or has taken it over."""
 
     NOBODYS = auto()  #: as far as is known, the vehicle is not flying
-    OURS = auto()  #: an application of this proxy, or the proxy ending an application's flight
-    OTHERS = auto()  #: a remote control, a ground station, another program
+    OURS = auto()  #: an application of this proxy, or the proxy itself to end an application's flight
+    OTHERS = auto()  #: a remote control, a ground station or another program
 
 
 class Changed(NamedTuple):
-    """The flight has changed hands. ``why``: text to publish, empty if already published."""
+    """The flight has changed hands. ``why`` is the text to publish, empty if already published."""
 
     whose: Whose
     why: str = ""
 
 
 class Snapshot(NamedTuple):
-    """The vehicle's known state for one decision: read once, and passed on."""
+    """The known state of the vehicle for one decision, read once and passed on."""
 
     now_ns: int
     state: FlightState
-    feedback: Feedback | None  #: the newest sample; None: none yet
+    feedback: Feedback | None  #: the newest sample; None if there is none yet
     link: LinkState
     link_up: bool
 
@@ -78,34 +78,34 @@ class Flight:
     called under the command handler's lock.
 
     Args:
-        native: The actions that the vehicle itself supports. A software-steered vehicle without native take-off and
-            landing has no concept of a flight: its flight state follows from its commands and observations.
-        shared: Whether others may also fly the vehicle; otherwise a flight is never others'.
+        native: The actions that the vehicle itself supports. A vehicle steered in software that has no take-off and
+            landing of its own has no concept of a flight; its flight state follows from commands and observations.
+        shared: Whether others may also fly the vehicle; if not, flights never belong to others.
     """
 
     def __init__(self, native: frozenset[str] = frozenset(), *, shared: bool = True) -> None:
         self._shared = shared
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
-        self.left_to = ""  #: what others made it do, in the driver's word
-        self._believed_until_ns: int | None = None  # a vehicle found in the air until then is on an old run's flight
-        self._claimed_until_ns: int | None = None  # deadline for a requested take-off to show
-        self._grounded_ns: int | None = None  # since when it has been standing
-        self._steered = False  # in software, with the task of :attr:`_state`
-        self._state = FlightState.LANDED  # of a vehicle without a concept of flight, or of the steered task
+        self.left_to = ""  #: the driver's word for what others made it do
+        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air is on an old run's flight
+        self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
+        self._grounded_ns: int | None = None  # when it began to be on the ground
+        self._steered = False  # whether it is steered in software, with the task in :attr:`_state`
+        self._state = FlightState.LANDED  # state of a vehicle without a concept of flight, or the steered task
         self._begun_ns = 0  # when the steered task began
-        self._was_up = False  # the vehicle has reported to be in the air while steered
-        self._landed_ns: int | None = None  # since when it has reported standing while steered
-        self._seen = False  # an altitude has been seen
+        self._was_up = False  # whether the vehicle has reported being in the air while steered
+        self._landed_ns: int | None = None  # when it began to report being landed while steered
+        self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
-        self._blind_ns: int | None = None  # since when a landing has had no sensor evidence
-        self._sent_up = False  # the newest action is one for the air
-        self._seen_up = False  # it was seen in the air, and not on the ground since
+        self._blind_ns: int | None = None  # when a landing ceased to have sensor data
+        self._sent_up = False  # whether the newest action is one for flight
+        self._seen_up = False  # whether it was seen in the air, and not on the ground since
 
     # Does it fly? ------------------------------------------------------------------------------------------------
 
     def state(self, reported: FlightState) -> FlightState:
-        """Return the flight state, given the driver's. Thread-safe."""
+        """Return the flight state, given the one reported by the driver. Thread-safe."""
         state = self._state
         if reported is FlightState.EMERGENCY:
             return reported
@@ -120,26 +120,26 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether it flies, or may fly, in a state of :meth:`state`. Thread-safe.
+        """Return whether it flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
 
-        A vehicle in an unknown state flies if it was seen flying, or from the first command to fly on.
+        In an unknown state, it flies if it was seen flying, or has been commanded to fly.
         """
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
-        """Return whether a requested take-off does not show yet, so that a standing vehicle may be about to fly."""
+        """Return whether a take-off has no visible effect yet, so that a vehicle on the ground may be about to fly."""
         return self._claimed_until_ns is not None and now_ns < self._claimed_until_ns
 
     # Whose is it? ------------------------------------------------------------------------------------------------
 
     @property
     def ours(self) -> bool:
-        """Whether the proxy may hold, land or stop the vehicle on its initiative."""
+        """Whether the proxy may hold, land or stop the vehicle on its own initiative."""
         return self.whose is Whose.OURS
 
     @property
     def others(self) -> str:
-        """Why the vehicle is left alone, for people; empty if it is not flown by others."""
+        """Readable reason why the vehicle is left alone; empty if it is not flown by others."""
         if self.whose is not Whose.OTHERS:
             return ""
         if self.left_to:
@@ -148,36 +148,36 @@ class Flight:
 
     @property
     def awaited(self) -> bool:
-        """Whether a flight of an earlier run may still turn up."""
+        """Whether a flight from an earlier run may still turn up."""
         return self._believed_until_ns is not None
 
     def began_before(self, until_ns: int) -> None:
-        """Count a vehicle found in the air until then as on a flight of an earlier run."""
+        """Assume that a vehicle found in the air until then is on a flight from an earlier run."""
         self._believed_until_ns = until_ns
 
     def claim(self, now_ns: int) -> None:
-        """Note a requested take-off: the resulting flight is ours."""
+        """Record a requested take-off, so that the resulting flight is ours."""
         self._claimed_until_ns = now_ns + CLAIM_NS
         if self.whose is Whose.NOBODYS:
             self.whose = Whose.OURS
 
     def call_off(self, now_ns: int) -> None:
-        """Note that a take-off that does not show yet is cancelled."""
+        """Record that a take-off without visible effect yet has been cancelled."""
         if self._claimed_until_ns is not None:
             self._claimed_until_ns = min(self._claimed_until_ns, now_ns + CALLED_OFF_NS)
 
     def take(self) -> None:
-        """Note that an application's new intent was executed: from here on, the flight is ours."""
+        """Record that an application's new intent was executed; from now on, the flight is ours."""
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Note that a vehicle found in the air from now on may be on another flight; return whether it may."""
+        """Assume that a vehicle found in the air from now on may be on another flight; return whether it may."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared
 
     def slept(self, ns: int) -> None:
-        """Note that the computer slept, which its clock does not count: it may be another flight by now."""
+        """Handle a sleep of the computer, which its clock does not count: it may be another flight by now."""
         if self._believed_until_ns is not None:
             self._believed_until_ns -= ns
         if self._claimed_until_ns is not None:
@@ -190,8 +190,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        ``left_to``: what others made the vehicle do since we last steered, as the driver observes it. ``feedback``: the
-        newest sample, if the link is up and the sample is fresh; None: no current data.
+        ``left_to``: what others have made the vehicle do since we last steered, according to the driver. ``feedback``:
+        the newest sample, if it is fresh and the link is up; otherwise None.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._observe_unsteered(reported, left_to, feedback.altitude_m)
@@ -206,7 +206,7 @@ class Flight:
             if state in _AIRBORNE:
                 self._seen_up = True
             if flies:
-                self._claimed_until_ns = None  # the take-off shows
+                self._claimed_until_ns = None  # the take-off is visible
             if left_to:
                 self.whose, self.left_to = Whose.OTHERS, left_to
             elif flies and self.whose is Whose.NOBODYS:
@@ -216,7 +216,7 @@ class Flight:
         return None if self.whose is before else Changed(self.whose, self._change_text(before))
 
     def _observe_unsteered(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
-        """Observe a vehicle without a concept of flight while nothing is steered."""
+        """Observe a vehicle without a concept of flight while it is not steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
             if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot flies it past its driver
@@ -237,7 +237,7 @@ class Flight:
 
     def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver reported who took it, or the flight is over, or it can only be ours
+            return ""  # the driver has reported who took it, the flight is over, or it can only be ours
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
@@ -245,20 +245,20 @@ class Flight:
     # Commands ------------------------------------------------------------------------------------------------------
 
     def sent(self, action: Action) -> None:
-        """Note the applied action."""
+        """Record the action that was applied."""
         self._sent_up = isinstance(action, _FLYING)
         if isinstance(action, EmergencyStop):
             self._seen_up = False
 
     def steer(self, state: FlightState, now_ns: int) -> None:
-        """Note that the software autopilot starts the task with this state."""
+        """Record that the software autopilot is starting the task with this state."""
         if not self._steered:
             self._was_up, self._landed_ns = False, None
         self._steered, self._state, self._begun_ns = True, state, now_ns
         self._start_descent(now_ns)
 
     def let_go(self, action_name: str) -> None:
-        """Note that the vehicle itself executes an action now."""
+        """Record that the vehicle itself is now executing an action."""
         self._steered = False
         if action_name == "emergency_stop":
             self._state = FlightState.EMERGENCY
@@ -268,22 +268,22 @@ class Flight:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
     def refused(self, reported: FlightState) -> bool:
-        """Note a refusal by the vehicle; return whether that ends a take-off from the ground."""
+        """Handle a refusal by the vehicle; return whether it ends a take-off from the ground."""
         if not (self._steered and self._state is FlightState.TAKING_OFF and reported is FlightState.LANDED):
             return False
         self._steered, self._state = False, FlightState.LANDED
         return True
 
     def lifted(self, reported: FlightState) -> bool:
-        """Return whether it has left the ground in a take-off, or does not report it."""
+        """Return whether it has left the ground in a take-off, or does not report that."""
         return not self._has_no_notion or self._was_up or reported is not FlightState.LANDED
 
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
-        """Return whether the steered task has ended on the ground; then it is no longer steered.
+        """Return whether the steered task has ended on the ground, so that the vehicle is no longer steered.
 
-        The vehicle's report counts, if it reports its state. Otherwise a descent has reached the ground when the
-        altimeter, near the ground, shows no headway. A landing without either continues for :data:`BLIND_NS`, with an
-        unknown result. ``feedback``: as in :meth:`observe`.
+        If the vehicle reports its state, that counts. Otherwise a descent has reached the ground when the altimeter,
+        near the ground, shows no progress. A landing without either continues for :data:`BLIND_NS`, and its result is
+        unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:
@@ -291,7 +291,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # It may be about to rise: reports from before the command prove nothing.
+            # It may be about to rise, so reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

@@ -1,4 +1,4 @@
-"""Settings of the flight from the parameters: limits for set-points, and others. Pure."""
+"""Flight settings, derived from parameters: limits for set-points, and others. Pure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from skyloop.zones import Space, space_of
 #: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches.
 #: Above the limit, it sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
-#: Altitudes this little above ``limits.altitude`` count as the altimeter's noise [m].
+#: Altitudes above ``limits.altitude`` by up to this much count as altimeter noise [m].
 SLACK_M: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Clamp:
-    """A limit that shortened a set-point. For tilt and speed, the two numbers are lengths of the vector."""
+    """A limit that reduced a set-point. For tilt and speed, the two numbers are lengths of the vector."""
 
     limit: str  #: name of the parameter
     asked: float
@@ -32,16 +32,16 @@ class Clamp:
 class Limits:
     """The effective limits."""
 
-    tilt: float = 0.35  #: maximum tilt from the vertical by roll and pitch together [rad]
+    tilt: float = 0.35  #: maximum tilt from the vertical, by roll and pitch combined [rad]
     climb: float = 1.0  #: maximum speed up or down [m/s]
-    yaw_rate: float = 1.75  #: [rad/s]
+    yaw_rate: float = 1.75  #: maximum yaw rate [rad/s]
     speed: float = 2.0  #: maximum horizontal speed [m/s]
     altitude: float = 5.0  #: maximum height above ground [m]
 
     def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
         """Return the nearest set-point within the limits, and the limits that applied.
 
-        Tilt and horizontal speed are shortened without changing their direction. ``altitude`` [m], if known.
+        Tilt and horizontal speed are reduced without changing their direction. ``altitude`` is given [m] if known.
         """
         if type(action) is Velocity:
             x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
@@ -49,7 +49,7 @@ class Limits:
             assert isinstance(action, Attitude)
             x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
         highest = self.climb
-        if altitude is not None:  # above the limit it is negative: the vehicle descends
+        if altitude is not None:  # above the limit, room is negative and the vehicle descends
             room = self.altitude - altitude
             highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
         if (
@@ -75,25 +75,25 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class AirspaceSettings:
-    """Parameters about where the vehicle may fly, and how fast."""
+    """Parameters for where the vehicle may fly, and how fast."""
 
     limits: Limits = field(default_factory=Limits)
     space: Space = field(default_factory=Space)
-    deceleration: float = 1.0  #: that the vehicle can reliably achieve [m/s²]
-    reaction_s: float = 0.3  #: delay before it starts to brake
+    deceleration: float = 1.0  #: deceleration that the vehicle can reliably achieve [m/s²]
+    reaction_s: float = 0.3  #: delay before the vehicle begins to brake
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeSettings:
-    """The failsafe's thresholds. Times in s, battery as charge from 0 to 1."""
+    """The failsafe's thresholds: times in s, battery levels as charge from 0 to 1."""
 
     hover_after_s: float = 0.5
     land_after_s: float = 5.0
     retry_s: float = 0.25
     battery_warn: float = 0.2
-    battery_land: float = 0.1  #: 0: never
-    battery_return: float = 0.0  #: 0: never
-    returns: bool = False  #: without a pilot, it lands at the start
+    battery_land: float = 0.1  #: charge at which to land; 0: never
+    battery_return: float = 0.0  #: charge at which to return; 0: never
+    returns: bool = False  #: whether a vehicle without a pilot lands at its start
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,20 +112,20 @@ class AutopilotSettings:
 class ReturnSettings:
     """Settings of a return."""
 
-    height: float = 2.0  #: minimum above the start on the way [m]
-    speed: float = 1.0  #: maximum on the way [m/s]
-    land: bool = True  #: land at the end, or hover there
+    height: float = 2.0  #: minimum height above the start on the way [m]
+    speed: float = 1.0  #: maximum speed on the way [m/s]
+    land: bool = True  #: whether to land at the end rather than hover
 
 
 @dataclass(frozen=True, slots=True)
 class FlightSettings:
-    """All settings of the flight."""
+    """All flight settings."""
 
     airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
     failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
     autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
     returns: ReturnSettings = field(default_factory=ReturnSettings)
-    max_age_ns: int = 0  #: maximum age of a command
+    max_age_ns: int = 0  #: maximum age of a command [ns]
     authority_timeout_ns: int = 0
     authority_ask_ns: int = 0
 

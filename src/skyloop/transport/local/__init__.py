@@ -1,8 +1,8 @@
-"""The transport of one host: a Unix ``SOCK_SEQPACKET`` connection per application, frames in sealed shared memory.
+"""The transport within one host: a Unix ``SOCK_SEQPACKET`` connection per application, and sealed shared memory.
 
 The kernel keeps packets whole, reports at once when the other end dies, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later; elsewhere no proxy is listed, and using the other names here raises
-:class:`UnsupportedError`.
+behind after a crash. It needs Linux 5.1 or later; on other systems, no proxies are listed, and using anything else here
+raises :class:`UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """List the running proxies on this host that this user may reach.
+    """List the running proxies on this host that this user can reach.
 
     Removes sockets left by killed proxies.
 
@@ -83,7 +83,7 @@ def list_names(*, group: str | None = None) -> list[Proxy]:
 
 
 def names_of_others() -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user. This user may not reach them."""
+    """Return the names of other users' proxies on this host, by user. This user can't reach them."""
     if sys.platform != "linux":
         return {}
     from skyloop.transport.local.directory import directory_owner, of_others
@@ -96,7 +96,7 @@ def names_of_others() -> dict[str, list[str]]:
 
 
 def __getattr__(name: str) -> Any:
-    # The modules need fcntl and can't even be imported elsewhere, so they are imported on demand.
+    # The modules need fcntl and can't be imported on other systems, so they are imported on demand.
     if name == "LocalServer":
         _check_platform()
         from skyloop.transport.local.server import LocalServer

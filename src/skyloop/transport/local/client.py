@@ -24,12 +24,12 @@ from skyloop.transport.local import packets
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
-_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is a few bytes larger than its header's
+_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
-_RETRY_S: Final = 0.25  # for packets that did not fit into a full socket
-_CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over, while nothing arrives
-_STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread returned with its sample
-_MAX_CAPACITY: Final = 1 << 31  # most memory that a client lets a server make it map
+_RETRY_S: Final = 0.25  # interval of retries for packets that did not fit into a full socket
+_CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over if nothing arrives
+_STAND_BY_S: Final = 0.002  # how long to let no thread receive after the leading thread has returned with its sample
+_MAX_CAPACITY: Final = 1 << 31  # maximum memory that a client maps for a server
 _log = logging.getLogger(__name__)
 
 
@@ -43,9 +43,9 @@ class LocalClient(TransportClient):
     """
 
     # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
-    # for a sample and *leads* meanwhile. Then a sample wakes that thread alone. Handing it from one thread to the other
-    # takes a second wake-up, which costs as much as the whole path from the proxy. During a lead the receiving thread
-    # stands by; it takes over when no thread has received for two milliseconds.
+    # for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing it to another thread takes
+    # a second wake-up, which costs as much as the whole path from the proxy. While a thread leads, the receiving thread
+    # stands by; it takes over once no thread has received for two milliseconds.
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -58,17 +58,17 @@ class LocalClient(TransportClient):
         self._closing = False
         self._reason = ""
         self._turn = threading.Lock()
-        self._receiver = 0  # identity of the thread that has the turn
-        self._ended = ""  # why receiving has ended
+        self._receiver = 0  # identity of the thread that holds the turn
+        self._ended = ""  # why receiving has ended; empty if it has not
         self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to lead
-        self._releases: deque[bytes] = deque()  # of frames dropped during a delivery
+        self._releases: deque[bytes] = deque()  # packets that release frames dropped during a delivery
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Drop a forked child's copy of the connection; a shutdown would end the parent's connection, too."""
+        """Drop a forked child's copy of the connection, without a shutdown, which would end the parent's, too."""
         sock, self._socket = self._socket, None
         self._ended = "the connection belongs to the parent process"
         if sock is not None:
@@ -132,14 +132,14 @@ class LocalClient(TransportClient):
     def _release(self, slot: int) -> None:
         packet = packets.release(slot)
         if self._receiver == threading.get_ident():
-            self._releases.append(packet)  # after the delivery, which another thread waits for
+            self._releases.append(packet)  # sent after the delivery, which another thread is waiting for
         else:
             self._send_own(packet)
 
     def _send_own(self, packet: bytes) -> None:
-        """Send one of the transport's own packets, later if it does not fit now.
+        """Send one of the transport's own packets, or queue it if it does not fit now.
 
-        The garbage collector may call this at any point of any thread, so it must not acquire a lock.
+        The garbage collector may call this on any thread at any point, so it must not acquire a lock.
         """
         sock = self._socket
         if sock is None:
@@ -191,7 +191,7 @@ class LocalClient(TransportClient):
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
         """Deliver until ``over`` returns True or the connection ends.
 
-        On the application's main thread, an exception from a signal handler during the wait is raised from here.
+        On the application's main thread, an exception raised by a signal handler during the wait propagates from here.
         """
         self._receiver = threading.get_ident()
         try:
@@ -200,7 +200,7 @@ class LocalClient(TransportClient):
             self._receiver = 0
 
     def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
-        """Deliver until ``over`` returns True, or the connection ends; then return the reason."""
+        """Deliver until ``over`` returns True or the connection ends; if it ended, return the reason."""
         receive = sock.recvmsg
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
@@ -213,10 +213,10 @@ class LocalClient(TransportClient):
                     return ""
                 continue
             except ConnectionResetError:
-                continue  # packets sent before it still arrive, and then the end
+                continue  # packets sent earlier still arrive, followed by the end
             except OSError as error:
                 if error.errno is None:
-                    raise  # not from the kernel: a signal handler raised it, for example a TimeoutError
+                    raise  # raised by a signal handler, not the kernel; for example, a TimeoutError
                 return f"receiving failed: {error}"
             kind = packet[5:6]
             try:
@@ -269,7 +269,7 @@ class LocalClient(TransportClient):
                 os.close(descriptor)
 
     def _send_waiting(self, sock: Socket) -> None:
-        """Send the releases of this turn, and packets that did not fit into the socket before."""
+        """Send the releases from this turn, and packets that did not fit into the socket earlier."""
         while self._releases:
             self._unsent.append(self._releases.popleft())
         try:
@@ -282,7 +282,7 @@ class LocalClient(TransportClient):
 
 
 def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """Return a packet's descriptors."""
+    """Return the descriptors that came with a packet."""
     descriptors = array.array("i")
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
@@ -291,7 +291,7 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """One slot at a client, mapped once, read-only."""
+    """A client's view of one slot, mapped once and read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
@@ -302,18 +302,17 @@ class SlotView:
             number: The slot's number on the wire.
             camera: The camera's number.
             capacity: The slot's size [bytes].
-            fd: The slot's descriptor, which the caller keeps.
-            held: The numbers of all slots of this camera that the application holds; shared with the camera's other
-                slots.
+            fd: The slot's descriptor, which still belongs to the caller.
+            held: The numbers of all of this camera's slots that the application holds; shared by the camera's slots.
 
         Raises:
-            LinkError: The memory could shrink during reading, or is smaller than announced.
+            LinkError: The memory could shrink while it is read, or is smaller than announced.
             OSError: The memory can't be mapped.
         """
         self.number = number
         self.camera = camera
         self.capacity = capacity
-        self.held = held  #: numbers of all slots of this camera that the application holds
+        self.held = held  #: numbers of all of this camera's slots that the application holds
         try:
             seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
         except OSError:
@@ -338,7 +337,7 @@ class SlotView:
 
 
 class Lease:
-    """The owner of a frame's pixels: while any array over them exists, the server does not reuse the slot."""
+    """Owns a frame's pixels: as long as any array over them exists, the server does not reuse the slot."""
 
     __slots__ = ("__array_interface__", "_leases", "_slot")
 
@@ -354,14 +353,14 @@ class Lease:
 class Leases:
     """A client's slots.
 
-    The garbage collector calls :meth:`released` on any thread and at any point.
+    The garbage collector may call :meth:`released` on any thread at any point.
 
     Args:
         send_release: Returns a slot to the server by its number; must not acquire a lock.
     """
 
-    #: Frames of one camera that an application may hold in place. Further ones are copied, so that an application that
-    #: collects frames does not exhaust the server's limit and starve itself.
+    #: Number of a camera's frames that an application may hold in place. Further ones are copied, so that an
+    #: application that collects frames does not exhaust the server's limit and starve itself.
     IN_PLACE: Final = 3
 
     def __init__(self, send_release: Callable[[int], None]) -> None:
@@ -376,7 +375,7 @@ class Leases:
             number: The slot's number.
             camera: The camera's number.
             capacity: The slot's size [bytes].
-            fd: The slot's descriptor, which the caller keeps.
+            fd: The slot's descriptor, which still belongs to the caller.
 
         Raises:
             LinkError: The memory is unusable.
@@ -393,8 +392,8 @@ class Leases:
     def end(self) -> None:
         """Forget all slots at the end of the connection; frames that the application still holds stay valid.
 
-        Those frames refer to this object, and the collector does not search arrays for cycles. A reference from here to
-        the client, its handler and the frames that the handler keeps would therefore keep all of them for ever.
+        Those frames refer to this object, and the garbage collector does not search arrays for cycles. So a reference
+        from here to the client, its handler and the frames that it keeps would keep all of them alive forever.
         """
         self._slots.clear()
         self._send_release = _discard_release
@@ -424,7 +423,7 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """Return a slot to the server, when the application's last array over it is gone."""
+        """Return a slot to the server, now that the application's last array over it is gone."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)
 

@@ -1,14 +1,14 @@
-"""The directory of sockets, where proxies are found by name, and its access rules.
+"""The directory of sockets, in which proxies are found by name, and its access rules.
 
-Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter: the value of
-the variable ``SKYLOOP_RUNTIME_DIR``, or else ``skyloop`` in the user's runtime directory. A process that changes the
-directory holds an advisory lock, which the kernel releases with the process. The lock is on the directory itself. If a
-group may read the directory, the lock is on the file ``.lock`` in it, which only the owner can open, so that no member
-of the group can block a proxy. Reading needs no lock.
+Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter. It is given
+by the variable ``SKYLOOP_RUNTIME_DIR``; the default is ``skyloop`` in the user's runtime directory. A process that
+changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is on the
+directory itself or, if a group may read the directory, on the file ``.lock`` in it, which only the owner can open, so
+that members of the group can't block a proxy. Reading needs no lock.
 
-The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket shows whether a
-process still listens: the kernel answers at once, unnoticed by the owner, with ``EPROTOTYPE`` for a live socket and
-``ECONNREFUSED`` for a dead one.
+The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket reveals whether a
+process is still listening: the kernel answers at once, without the owner noticing, with ``EPROTOTYPE`` for a live
+socket and ``ECONNREFUSED`` for a dead one.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
 PROXY: Final = "proxy"
-HOST: Final = "host"  #: a host of many proxies: its socket accepts requests to add and remove vehicles
+HOST: Final = "host"  #: a host for many proxies, whose socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
-_OPEN_TO_OTHERS: Final = 0o027  # writable by the group, or anything for others
+_OPEN_TO_OTHERS: Final = 0o027  # permissions: writable by the group, or any access for others
 
 
 class Proxy(NamedTuple):
     """A running proxy on this host."""
 
     name: str
-    pid: int | None  #: process id; None if the process is too busy to tell
-    path: Path  #: its socket
+    pid: int | None  #: process id; None if the process is too busy to report it
+    path: Path  #: path of its socket
 
 
 class Directory:
@@ -56,7 +56,7 @@ class Directory:
     Args:
         path: The absolute path.
         gid: The group that shares it; None for this user alone.
-        kind: Whose sockets: :data:`PROXY` or :data:`HOST`. Each kind has its own names.
+        kind: Kind of the sockets, :data:`PROXY` or :data:`HOST`. Each kind has its own names.
     """
 
     def __init__(self, path: Path, gid: int | None, kind: str = PROXY) -> None:
@@ -81,7 +81,7 @@ class Directory:
         return path
 
     def create(self) -> None:
-        """Create the directory if missing, give it to the group if there is one, and check it.
+        """Create the directory if it is missing, give it to the group if there is one, and check it.
 
         Raises:
             LinkError: The directory is not safe; see :meth:`check`.
@@ -145,15 +145,15 @@ class Directory:
         return found
 
     def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy, if the lock is free: a reader never waits."""
+        """Remove the socket of a killed proxy, unless the lock is held, because a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
-            return  # members of a group may look, but not remove
+            return  # members of a group may read the directory, but not remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
             if not is_live(path):  # a proxy may have taken the name since
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
-        """Listen under a name, in place of a killed proxy of that name.
+        """Listen under a name, replacing a killed proxy with that name.
 
         Args:
             name: The proxy's name.
@@ -185,7 +185,7 @@ class Directory:
             return listener, path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
-        """Remove the socket of a name if its file still has this inode; errors are ignored."""
+        """Remove the socket with this name if its file still has this inode; errors are ignored."""
         path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
             if path.lstat().st_ino == inode:
@@ -207,7 +207,7 @@ class Directory:
             path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
         try:
-            if path is not self.path and os.geteuid() == 0:  # root may have created it, in another user's directory
+            if path is not self.path and os.geteuid() == 0:  # root may have created it in another user's directory
                 os.fchown(descriptor, here.st_uid, -1)
             _lock(descriptor, path, timeout_s)
             yield
@@ -223,11 +223,11 @@ class Directory:
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return this user's directory, or the one that a group shares. Touches no file.
+    """Return this user's directory, or the one shared by a group, without touching any file.
 
     Args:
         group: The name of the group (default: the variable ``SKYLOOP_GROUP``).
-        kind: Kind of its sockets.
+        kind: Kind of the sockets in it.
 
     Raises:
         UsageError: The group does not exist, or no directory is configured that its members can reach.
@@ -254,7 +254,7 @@ def _default_path() -> Path:
     import platformdirs
 
     with warnings.catch_warnings():
-        # It warns if there is no XDG_RUNTIME_DIR; the safety of the fallback is checked here.
+        # Ignore the warning about a missing XDG_RUNTIME_DIR, as the safety of the fallback is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 
@@ -267,7 +267,7 @@ def is_live(path: Path) -> bool:
 
 
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user: their sockets are closed to us.
+    """Return the names of other users' proxies on this host, by user; we can't open their sockets.
 
     Args:
         table: Content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
@@ -278,7 +278,7 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
         path = Path(line[line.find("/") :]) if "/" in line else Path()
         name = path.name.removesuffix(_SUFFIXES[PROXY])
         if path.parent.name != "skyloop" or name == path.name or not NAME.fullmatch(name):
-            continue  # a directory of another name may belong to any program
+            continue  # a directory with another name may belong to any program
         user = owner(path.parent)
         if user is not None and user != os.geteuid() and name not in found.setdefault(user_name(user), []):
             found[user_name(user)].append(name)
@@ -286,7 +286,7 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
 
 
 def directory_owner(path: Path) -> int | None:
-    """Return a directory's owner, or that of its nearest visible parent if it can't be seen itself."""
+    """Return the owner of a directory or, if it is not visible, of its nearest visible parent."""
     for folder in (path, *path.parents):
         with contextlib.suppress(OSError):
             return folder.lstat().st_uid
@@ -294,7 +294,7 @@ def directory_owner(path: Path) -> int | None:
 
 
 def owner_pid(path: Path) -> int | None:
-    """Return the id of the process that listens at this path; None if that is not known at once."""
+    """Return the id of the process listening at this path; None if it can't be determined at once."""
     probe = Socket()
     probe.setblocking(False)
     try:
@@ -311,7 +311,7 @@ def connect(path: Path) -> Socket:
         OSError: There is no socket, or no process accepts within :data:`CONNECT_TIMEOUT_S`.
     """
     sock = Socket()
-    # Without a time-out, connecting to a stopped process with a full queue would block for ever.
+    # Without a time-out, connecting to a stopped process whose queue is full would block forever.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
     sock.connect(os.fspath(path))
     return sock

@@ -1,8 +1,8 @@
-"""The server's frame slots: which are free, which clients hold them, and which viewers wait for the newest frame.
+"""Manage the server's frame slots: which are free, which clients hold them, and which viewers await a frame.
 
 A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
-:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. There
-are always enough slots, because each viewer can hold only a limited number.
+:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. The
+slots never run out, because each viewer can hold only a limited number.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 
-MAX_LEASES: Final = 4  #: frames of one camera that one client may hold: in transit, or in use
+MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, in transit or in use
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# After mapping it, the server keeps its own writeable view; no one can create another or change the size. If a slot
-# could shrink while a reader has it mapped, reading it would kill the reader (SIGBUS).
+# After mapping the memory, the server keeps its own writeable view; no other can be created, nor the size changed. If a
+# slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
@@ -51,9 +51,9 @@ class SlotMemory:
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that hold it, and the server while it writes to it or keeps it for waiting viewers
+        self.holders = 0  #: clients that hold it, plus the server while it writes to it or keeps it for viewers
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.posix_fallocate(self.fd, 0, capacity)  # fails here when memory is short, rather than during a copy
+        os.posix_fallocate(self.fd, 0, capacity)  # fail here if memory is short, rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
         self.array: Pixels = np.frombuffer(view, np.uint8)
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
@@ -100,9 +100,9 @@ class Viewer:
         self.connection = connection
         self.leases: dict[int, SlotMemory] = {}
         self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number were retired, and the client must be notified; 0: none
+        self.retire_before = 0  #: slots below this number are retired, and the client must be notified; 0: none
         self.active = True  #: whether it gets frames; if not, it may still hold some
-        self.waits = False  #: whether it was skipped
+        self.waits = False  #: whether it was skipped, and waits for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
         """Send a frame, unless the viewer holds enough frames or its socket is full.
@@ -145,13 +145,13 @@ class Camera:
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
-        self.viewers: dict[Connection, Viewer] = {}  # inactive ones only hold frames
-        self.active: tuple[Viewer, ...] = ()  # those that get frames
+        self.viewers: dict[Connection, Viewer] = {}  # including inactive ones, which only hold frames
+        self.active: tuple[Viewer, ...] = ()  # viewers that get frames
         self._generation = 0
         self._geometry: object = None
         self._capacity = 0
         self._free: list[SlotMemory] = []
-        self._count = 0  # slots of this generation
+        self._count = 0  # number of slots in this generation
         self._slot_numbers = slot_numbers
         self._next_number = 0  # higher than the numbers of all slots so far
         self._newest: _Newest | None = None
@@ -164,13 +164,13 @@ class Camera:
         """
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
-            # The size of compressed frames varies: when one outgrows its slots, new slots get some spare room.
+            # The size of compressed frames varies, so when one outgrows its slots, new slots get some spare room.
             grows = geometry == self._geometry
             self.retire()
             self._geometry = geometry
             self._capacity = 1 << (header.size - 1).bit_length() if grows else max(header.size, 1)
         if self._free:
-            slot = self._free.pop()  # the one freed last is still in the processor's cache
+            slot = self._free.pop()  # the one freed last is likely still in the processor's cache
         else:
             slot = SlotMemory(next(self._slot_numbers), self._generation, self._capacity)
             self._next_number = slot.number + 1
@@ -199,13 +199,13 @@ class Camera:
         return missed
 
     def drop(self, slot: SlotMemory) -> None:
-        """Remove one hold on a slot; without holds it is free again."""
+        """Remove one hold on a slot, which is free again if there are no others."""
         slot.holders -= 1
         if slot.holders == 0 and slot.generation == self._generation:
             self._free.append(slot)
 
     def released(self, viewer: Viewer, number: int) -> bool:
-        """Take a slot back from a viewer, and send it the newest frame if it waits for one.
+        """Take a slot back from a viewer, and send it the newest frame if it is waiting for one.
 
         Returns:
             False if the viewer did not hold the slot.
@@ -226,10 +226,10 @@ class Camera:
         self._count_active()
 
     def unsubscribe(self, viewer: Viewer) -> None:
-        """Stop sending frames to a viewer; those it holds stay intact until it releases them."""
+        """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
-        with contextlib.suppress(OSError):  # then it keeps the slots mapped until it ends
+        with contextlib.suppress(OSError):  # if this fails, it keeps the slots mapped until it ends
             viewer.connection.transmit(packets.retire(self.number, self._next_number))
         self._trim()
 
@@ -251,7 +251,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Release the memory of all slots; slots in use follow when they are released."""
+        """Free the memory of all slots, or of slots in use as soon as they are released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -263,14 +263,14 @@ class Camera:
             viewer.retire_before = self._next_number
 
     def _keep(self, newest: _Newest | None) -> None:
-        """Keep a slot for waiting viewers, or none; the writer's hold on ``newest`` is passed on."""
+        """Keep a slot, or none, for waiting viewers; the writer's hold on ``newest`` is passed on to this object."""
         before, self._newest = self._newest, newest
         if before is not None:
             self.drop(before[0])
 
 
 class FrameExchange:
-    """All cameras of a server. Thread-safe; frames are copied outside its lock."""
+    """Manages all cameras of a server. Thread-safe; frames are copied outside its lock."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -286,7 +286,7 @@ class FrameExchange:
             pixels: ``header.size`` bytes, dtype uint8, any shape.
 
         Returns:
-            The number of viewers that did not get it; all of them if memory ran out.
+            The number of viewers that did not get the frame, which is all of them if memory ran out.
         """
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
@@ -332,5 +332,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # recreated for the next viewer: unused names must not accumulate
+                if not camera.viewers:  # it is recreated for the next viewer, because unused names must not accumulate
                     del self._cameras[name]

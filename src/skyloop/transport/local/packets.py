@@ -1,4 +1,4 @@
-"""The local transport's own packets: pure functions between bytes and typed tuples.
+"""The local transport's own packets: pure functions that convert between bytes and typed tuples.
 
 They share the header of all packets and use kinds from 0x40, which no sample has. ``docs/wire-format.md`` has the
 tables.
@@ -16,24 +16,24 @@ from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
 from skyloop.transport.base import MAX_TOPIC
 
 REVISION: Final = 1  #: revision of the local transport's own packets
-MAX_REASON: Final = 400  #: bytes of UTF-8
+MAX_REASON: Final = 400  #: bytes of UTF-8 in a reason
 
 
 class LocalKind(IntEnum):
     """Kinds of packets that the two ends exchange between themselves."""
 
-    HELLO = 0x40  #: first packet of a client
+    HELLO = 0x40  #: a client's first packet
     SUBSCRIBE = 0x41  #: client to server
     RELEASE = 0x42  #: client to server: the frame in this slot is no longer used
     SLOT = 0x43  #: server to client, with the slot's descriptor
     FRAME = 0x44  #: server to client: a slot holds a frame
-    RETIRE = 0x45  #: server to client: older slots of a camera will not be used again
+    RETIRE = 0x45  #: server to client: a camera's older slots will not be used again
     BYE = 0x46  #: either direction: why the connection ends
     WAKE = 0x47  #: client to server: sent before each command by older applications, and ignored
 
 
-# A packet's sixth byte is its kind; it is compared with these without conversion.
-OWN: Final = bytes([LocalKind.HELLO])  #: from this kind on, packets are the transport's own
+# A packet's sixth byte is its kind, which is compared with these without conversion.
+OWN: Final = bytes([LocalKind.HELLO])  #: packets of this kind and above are the transport's own
 FRAME: Final = bytes([LocalKind.FRAME])
 
 
@@ -79,7 +79,7 @@ class Retire(NamedTuple):
 
 
 class Bye(NamedTuple):
-    """Why the connection ends."""
+    """The reason why the connection ends."""
 
     reason: str
 
@@ -94,7 +94,7 @@ _FRAME_PREFIX = struct.Struct(HEADER.format + "I")
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet is for the transport itself rather than the handler."""
+    """Return whether a packet is meant for the transport itself rather than the handler."""
     return packet[5:6] >= OWN and packet.startswith(SIGNATURE)
 
 
@@ -176,7 +176,7 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello | Release | Slot | Retir
 
 
 def parse_frame(packet: bytes) -> Frame:
-    """Decode a frame's packet, header and slot in one step, as these are frequent.
+    """Decode a frame's packet, header and slot in one step, because such packets are frequent.
 
     Raises:
         DecodeError: The packet is of another kind, or damaged.

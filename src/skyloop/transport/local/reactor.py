@@ -1,13 +1,13 @@
-"""One thread that receives for many local transport servers; the others can leave it when one of them blocks it.
+"""One thread that receives for many local transport servers, which can leave it if one of them blocks it.
 
 A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call fewer, which is
-better for one vehicle. For a hundred vehicles that makes two hundred threads that wake one another. Here, one thread
+better for one vehicle. With a hundred vehicles, there would be two hundred threads waking one another. Here, one thread
 waits for all connections (epoll), reads all available packets, and handles one packet of each connection in turn.
-Landings and stops come first, then set-points, then the rest; each class gets some turns, however busy the others are.
+Landings and stops come first, then set-points, then the rest, but each class gets some turns even if others are busy.
 
-Handlers run on this thread. During a call, :attr:`Reactor.inside` holds its server and :attr:`Reactor.entries` counts
-the calls, so that a watchdog notices a call that does not return: :meth:`Reactor.split` then leaves this thread to that
-server alone and moves all others to a new reactor.
+Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server and :attr:`Reactor.entries`
+counts the calls, so that a watchdog can detect a call that does not return. It then calls :meth:`Reactor.split`, which
+leaves this thread to that server and moves all others to a new reactor.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
 CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
-_PAUSE_S: Final = 100e-6  # a wait this long shows that nothing was pending
-_PACKETS_PER_POLL: Final = 8  # packets handled before the next check for new ones
+_PAUSE_S: Final = 100e-6  # a wait this long means that nothing was pending
+_PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: The lane of each turn: even if there is always something urgent, the others each get one turn in four.
+#: Which lanes go first, turn by turn: even if something is always urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
@@ -63,9 +63,9 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: the lane it waits in
+        self.lane: Lane | None = None  #: the lane in which it waits
         self.ended = False
-        self.muted = False  #: ignored until the next check
+        self.muted = False  #: whether it is ignored until the next check
 
 
 class _Thread(threading.Thread):
@@ -76,7 +76,7 @@ class Reactor:
     """Receives for transport servers on one thread, from construction to :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: SharedLocalServer | None = None  #: server whose handler is, or may be, running
+        self.inside: SharedLocalServer | None = None  #: the server whose handler is, or may be, running
         self.entries = 0  #: how often :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -84,7 +84,7 @@ class Reactor:
         self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._epoll.register(self._waker, select.EPOLLIN)
         self._closing = False
-        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources with unhandled packets
+        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources with packets to handle
         self._resumed: deque[Source] = deque()
         self._turns = 0
         self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
@@ -108,11 +108,11 @@ class Reactor:
 
     @property
     def over(self) -> bool:
-        """Whether its thread has ended, so that nothing receives for its servers."""
+        """Whether its thread has ended, so that nothing is received for its servers."""
         return not self._thread.is_alive()
 
     def remaining_of(self, server: SharedLocalServer) -> list[Source]:
-        """Return a server's sockets that remained when the thread ended; none while it runs. Thread-safe."""
+        """Return a server's sockets left over when the thread ended; none while it runs. Thread-safe."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
 
@@ -124,7 +124,7 @@ class Reactor:
     def split(self, stuck: SharedLocalServer) -> Reactor:
         """Leave this reactor to one server, and return a new one that receives for all others. Thread-safe.
 
-        No packet is lost, none is delivered twice, and the packets of each connection keep their order.
+        No packet is lost or delivered twice, and the packets of each connection keep their order.
 
         Args:
             stuck: The server whose handler blocks the thread.
@@ -133,7 +133,7 @@ class Reactor:
             moved = [source for source in self._sources.values() if source.server is not stuck]
         new = Reactor()
         for server in {source.server for source in moved}:
-            server.reactor = new  # from here on, this thread handles none of their packets
+            server.reactor = new  # from here on, this thread doesn't handle any of their packets
         for source in moved:
             self.hand_over(source, new)
         new.resume(source for source in moved if source.lane is not None)
@@ -171,8 +171,8 @@ class Reactor:
                 self.inside = None
             begun_s = time.monotonic()
             ready = self._epoll.poll(0 if busy else CHECK_S)
-            # After a pause, a single packet is just one. Among many, checking each socket for another packet would cost
-            # one system call each: all sockets are polled together instead, until nothing new arrives.
+            # After a pause, a single packet is most likely alone. If there are many, checking each socket for another
+            # one would cost a system call each; instead, all sockets are polled together until nothing new arrives.
             waited = time.monotonic() - begun_s > _PAUSE_S
             try:
                 if self._receive(ready, at_once=waited and len(ready) == 1):
@@ -188,16 +188,16 @@ class Reactor:
                     self._check()
             except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must continue
                 _log.exception("a turn of the receiving thread failed; it continues")
-                time.sleep(_AFTER_FAILURE_S)  # the cause persists and must not use up the whole processor
+                time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up the whole processor
         self.inside = None
         os.close(self._waker)
         self._epoll.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
-        """Read a packet from each socket, so that urgent and superseded ones are known.
+        """Read a packet from each socket, to find out which are urgent or superseded.
 
         Returns:
-            Whether more may wait behind one of them.
+            Whether more may be waiting behind one of them.
         """
         sources, more = self._sources, False
         for fileno, _ in ready:
@@ -213,7 +213,7 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Queue a source for a turn in a lane; None: in no lane. On the reactor's thread."""
+        """Queue a source for a turn in a lane, or for None, in no lane. On the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
@@ -233,13 +233,13 @@ class Reactor:
         self.entries += 1
 
     def mute(self, source: Source) -> None:
-        """Ignore a listener until the next check: it can't accept, but would always be ready."""
+        """Ignore a listener until the next check, because it can't accept but would always be ready."""
         source.muted = True
         with self._lock, contextlib.suppress(OSError):
             self._epoll.modify(source.fileno, 0)
 
     def _check(self) -> None:
-        """End connections that sent nothing, and retry listeners."""
+        """End connections that have sent nothing, and retry listeners."""
         now_s = time.monotonic()
         with self._lock:
             sources = list(self._sources.values())
@@ -256,11 +256,11 @@ class Reactor:
 class SharedLocalServer(LocalServer):
     """A :class:`LocalServer` that shares its receiving thread with others.
 
-    Its handler must return quickly: a delay affects all of these servers, until :meth:`Reactor.split` is called.
+    Its handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
 
     Args:
         name: The proxy's name.
-        reactor: The reactor that receives for it, until a split.
+        reactor: The reactor that receives for it until a split.
         group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
 
     Raises:
@@ -274,7 +274,7 @@ class SharedLocalServer(LocalServer):
         self._listening: Source | None = None
         self._inode = 0
         self._served: set[ServerConnection] = set()
-        self._left = threading.Condition()  # guards the set; notified when a connection has gone
+        self._left = threading.Condition()  # guards the set; notified when a connection is gone
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         listener.setblocking(False)
@@ -303,7 +303,7 @@ class SharedLocalServer(LocalServer):
     def _drop(self, source: Source) -> None:
         """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # a socket on its way to another reactor is dropped there, on first sight
+        self.reactor.remove(source)  # a socket in transit to another reactor is dropped there as soon as it is seen
 
     # --- the reactor's thread ---
 
@@ -313,12 +313,12 @@ class SharedLocalServer(LocalServer):
         Args:
             reactor: The reactor of this thread.
             source: The readable source.
-            at_once: Whether nothing else waits for this thread, so that a command is handled here.
+            at_once: Whether nothing else is waiting for this thread, so that a command is handled right here.
 
         Returns:
-            Whether the packet waits for :meth:`deliver`, possibly with more behind it.
+            Whether the packet must be handled by :meth:`deliver`, possibly with more behind it.
         """
-        with self._lock:  # from receiving to handling, so that after a split nothing overtakes this thread's packet
+        with self._lock:  # held from receiving to handling, so that after a split nothing overtakes this packet
             if not self._is_current(reactor, source):
                 return False
             connection = source.connection
@@ -331,7 +331,7 @@ class SharedLocalServer(LocalServer):
             try:
                 packet = connection.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except (BlockingIOError, ConnectionResetError):
-                return False  # after a reset, packets sent before it still arrive, and then the end
+                return False  # after a reset, packets sent earlier still arrive, followed by the end
             except OSError as error:
                 self._finish_connection(source, connection, f"receiving failed: {error}")
                 return False
@@ -353,7 +353,7 @@ class SharedLocalServer(LocalServer):
             lane: The lane.
 
         Returns:
-            The lane to queue the source in again; None: no lane.
+            The lane in which to queue the source again; None for no lane.
         """
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
@@ -366,7 +366,7 @@ class SharedLocalServer(LocalServer):
             return None if source.ended else self._lane(source, connection)
 
     def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
-        """Return the lane to queue a source in; None: nothing waits, or it is already in that lane."""
+        """Return the lane in which to queue a source; None if nothing waits, or it is in that lane already."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
             lane = Lane.STEERING  # it will be refused
@@ -411,11 +411,11 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # it arrived while the others were being disconnected
+            if self._stopping.is_set():  # it connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
-        """Handle one packet; survive whatever the handler raises."""
+        """Handle one packet, surviving any error of the handler."""
         handler = self._handler
         assert handler is not None
         try:

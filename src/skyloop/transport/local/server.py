@@ -1,9 +1,9 @@
-"""The proxy's end of the local transport: one connection and one receiving thread per application.
+"""The proxy's end of the local transport, with one connection and one receiving thread per application.
 
 A dedicated thread in ``recv`` delivers a packet with one system call. Waiting for all connections at once (epoll) needs
-two, which made the delay of a command a third longer on an idle machine. The threads take turns at the handler, so that
-it gets one call at a time as the contract demands: those with a command first, the others in order of arrival. A thread
-whose turn comes late reads all its waiting packets and passes on only the newest of the set-points.
+two, which delayed commands by a third more on an idle machine. The threads take turns calling the handler, so that it
+gets one call at a time as the contract requires: those with a command go first, the others in order of arrival. A
+thread whose turn comes late reads all of its waiting packets, and passes on only the newest of the set-points.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Per process, so that no program can take all; a cockpit's page that flies has its own connection.
+#: Connections per process, so that no program can take them all; a cockpit's page that flies has its own connection.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: per user with access through a group; the proxy's own user may use all remaining places
+MAX_PER_USER: Final = 64  #: the same per user with access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: places reserved for pilots
-HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send as they connect
+HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send when they connect
 _RETRY_ACCEPT_S: Final = 0.2
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
 class LocalServer(TransportServer):
-    """A proxy's end, found on this host by its name. It can be started once.
+    """A proxy's end, which is found on this host by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
     of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature.
@@ -64,15 +64,15 @@ class LocalServer(TransportServer):
         check_name(name)
         self._name = name
         self._directory = find_directory(group)
-        self._directory.socket_path(name)  # raises here, rather than on start, if the path is too long
+        self._directory.socket_path(name)  # if the path is too long, raise here rather than on start
         self._exchange = FrameExchange()
-        # Replaced under the lock only, never changed in place, so that any thread may read them.
+        # These are replaced under the lock, never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
         self._peers: dict[int, ServerConnection] = {}  # by number of the peer
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
-        self._lock = PriorityLock()  # its holder may call the handler
+        self._lock = PriorityLock()  # a thread must hold it to call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # commands replaced by newer ones behind them
+        self._superseded = 0  # number of commands replaced by newer ones behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -91,7 +91,7 @@ class LocalServer(TransportServer):
             self._begin(handler, listener, inode)
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
-        """Start to accept and receive."""
+        """Start accepting and receiving."""
         self._thread = threading.Thread(
             target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
         )
@@ -182,12 +182,12 @@ class LocalServer(TransportServer):
                 thread.join()
 
     def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
-        """Accept one connection and start to receive from it; return its receiving thread, or None."""
+        """Accept one connection and start receiving from it; return its receiving thread, or None."""
         try:
             accepted, _ = listener.accept()
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
-                # Out of descriptors or memory: without a pause, this thread would only spin.
+                # Out of descriptors or memory: without a pause, this thread would spin.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
@@ -208,7 +208,7 @@ class LocalServer(TransportServer):
         return thread
 
     def _let_in(self, sock: Socket) -> ServerConnection | None:
-        """Return the caller's connection; None if it may not connect, or there is no place."""
+        """Return the caller's connection; None if it may not connect, or there is no room."""
         who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
@@ -224,10 +224,10 @@ class LocalServer(TransportServer):
         return connection
 
     def _make_room(self, who: Credentials) -> str:
-        """Find a place for a new connection; return why there is none, or an empty text.
+        """Make room for a new connection; return why there is none, or an empty text.
 
-        If all places are taken, the oldest connection that has not identified itself gives way. So any number of such
-        connections can't keep others out.
+        If all places are taken, the oldest connection that has not identified itself gives way, so that such
+        connections can't keep others out, however many there are.
         """
         with self._lock:
             present = [connection for connection in self._connections if not connection.ending]
@@ -271,10 +271,10 @@ class LocalServer(TransportServer):
             except OSError as error:
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
-                continue  # at once: a command behind it must not wait in line with it
+                continue  # handled at once, because a command behind it must not have to wait for it
             lock.acquire(is_command(packet))
             try:
-                if connection.pilot and poll(0):  # it waited: packets that arrived since may supersede it
+                if connection.pilot and poll(0):  # it had to wait, so packets that have arrived since may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
@@ -295,9 +295,9 @@ class LocalServer(TransportServer):
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why it ends the connection, empty if it does not. The lock is held."""
+        """Handle one packet; return why it ends the connection, or an empty text. The lock is held."""
         if not packet or connection.ending:
-            # An empty packet can't be distinguished from the end of the connection, so it counts as that.
+            # An empty packet can't be distinguished from the end of the connection, so it is treated as such.
             return f"the application is gone ({connection.peer.address})"
         if len(packet) > MAX_PACKET:
             return f"it sent a packet of more than {MAX_PACKET} bytes"
@@ -308,7 +308,7 @@ class LocalServer(TransportServer):
         return ""
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
-        """Handle a connection's first packet. A process that only asks which process listens sends none."""
+        """Handle a connection's first packet. A process that only wants to know who is listening sends none."""
         if packet != packets.hello():
             connection.hang_up(f"its Hello is not of revision {packets.REVISION} of the local transport")
             return
@@ -321,7 +321,7 @@ class LocalServer(TransportServer):
         """Handle one of the transport's own packets.
 
         Returns:
-            False for one that makes no sense: the handler gets it, like any garbage.
+            False if it makes no sense; the handler gets it, like any other garbage.
         """
         try:
             message = packets.parse(packet)
@@ -383,7 +383,7 @@ def _problem(topic: str, subscribed: int) -> str:
 
     Args:
         topic: The topic.
-        subscribed: Number of topics that the application has.
+        subscribed: Number of topics that the application has subscribed to.
     """
     if topic.startswith(_VIDEO) and "?" in topic:
         return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"

@@ -1,4 +1,4 @@
-"""The sockets of the local transport: the processes at their other ends, and connections at the server."""
+"""The local transport's sockets: which process is at the other end, and connections at the server."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from skyloop.transport.base import MAX_PACKET, Peer
 from skyloop.transport.local import packets
 from skyloop.transport.priority import MOST_PACKETS, PacketBacklog
 
-#: Enough for a packet of the largest size and a burst of small ones, and small enough to bound the backlog of a stalled
-#: reader (about 200 packets of 300 bytes).
+#: Size of the send buffer: room for the largest packet and a burst of small ones, but small enough to bound the backlog
+#: of a stalled reader (about 200 packets of 300 bytes).
 SEND_BUFFER: Final = 131_072
 SEND_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
-RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: for callers that wait by other means
+RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: flags for callers that wait by other means
 _SO_PEERGROUPS: Final = 59  # Linux 4.13; missing from Python's socket module
 _CREDENTIALS: Final = struct.Struct("3i")
-_MAX_OPTION: Final = 1024  # Python's limit for an option [bytes]: 256 groups
+_MAX_OPTION: Final = 1024  # Python's limit for an option [bytes], which is 256 groups
 
 
 class Socket(socket.socket):
     """A ``SOCK_SEQPACKET`` socket that closes when no longer referenced.
 
-    Both ends *shut down* a connection and drop their references, but never close it. So a descriptor's number can't be
-    reused while a thread is sending on it.
+    Both ends *shut down* a connection and drop their references, but never close it, so that a descriptor's number
+    can't be reused while a thread is sending on it.
 
     Args:
         fileno: An open descriptor to take over; None for a new socket.
@@ -37,13 +37,13 @@ class Socket(socket.socket):
 
     def __init__(self, fileno: int | None = None) -> None:
         super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno)
-        self.settimeout(None)  # whatever socket.setdefaulttimeout() is set to
+        self.settimeout(None)  # overrides socket.setdefaulttimeout()
 
     def __del__(self) -> None:
         self.close()
 
     def limit_backlog(self) -> None:
-        """Limit the unread data at the other end to :data:`SEND_BUFFER` bytes."""
+        """Limit the data waiting to be read at the other end to :data:`SEND_BUFFER` bytes."""
         self.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
@@ -63,7 +63,7 @@ class Socket(socket.socket):
 
 
 class Credentials(NamedTuple):
-    """The process at the other end, as the kernel saw it when it connected."""
+    """The process at the other end, according to the kernel at the time of connecting."""
 
     pid: int
     uid: int
@@ -74,12 +74,12 @@ class Credentials(NamedTuple):
 
 
 def credentials(sock: socket.socket) -> Credentials:
-    """Return the connecting process or, at a client, the listening one."""
+    """Return the connecting process or, if called by a client, the listening one."""
     return Credentials(*_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)))
 
 
 def peer_groups(sock: socket.socket) -> set[int]:
-    """Return all groups of the connecting user; only the primary one for a user in more than 256."""
+    """Return all groups of the connecting user; if there are more than 256, only the primary one."""
     primary = credentials(sock).gid
     try:
         raw = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_OPTION)
@@ -93,7 +93,7 @@ def may_connect(sock: socket.socket, gid: int | None) -> bool:
 
     Args:
         sock: The accepted connection.
-        gid: The group with access; None for none.
+        gid: The group that has access; None if there is none.
 
     Returns:
         True for a process of this process's user, of the superuser, or of a member of the group.
@@ -104,7 +104,7 @@ def may_connect(sock: socket.socket, gid: int | None) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def user_name(uid: int) -> str:
-    """Return a user's name, or ``uid 123`` without one."""
+    """Return a user's name, or ``uid 123`` if there is none."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -124,7 +124,7 @@ def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
 
 
 class ServerConnection:
-    """An application's connection: any thread may send without waiting, the rest belongs to its receiving thread.
+    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread.
 
     Args:
         sock: The accepted socket.
@@ -156,13 +156,13 @@ class ServerConnection:
         self.receive = sock.recv
         poll = select.poll()
         poll.register(sock, select.POLLIN)
-        self.poll = poll.poll  #: whether a packet, or the end, waits in the socket; for the receiving thread
-        self.backlog = PacketBacklog()  #: taken from the socket, but not handled yet
+        self.poll = poll.poll  #: returns whether a packet, or the end, is waiting; for the receiving thread
+        self.backlog = PacketBacklog()  #: packets taken from the socket, but not handled yet
         self.peer = peer
-        self.joined = False  #: it sent Hello, and the handler knows it
-        self.admitted = False  #: it identified itself, and the handler admitted it
-        self.pilot = False  #: it connected as a pilot
-        self.ending = False  #: by the server: earlier packets no longer count
+        self.joined = False  #: whether it has sent Hello, and the handler knows it
+        self.admitted = False  #: whether it has identified itself, and the handler has admitted it
+        self.pilot = False  #: whether it connected as a pilot
+        self.ending = False  #: whether the server is ending it, so that earlier packets no longer count
         self.reason = ""  #: why it ends, once one end has given a reason
         self.topics: set[str] = set()
 
@@ -171,7 +171,7 @@ class ServerConnection:
         return self._socket.fileno()
 
     def more(self) -> bool:
-        """Return whether a pilot's packet, or the end, waits in the socket; others' commands are refused anyway."""
+        """Return whether a pilot's packet, or the end, is waiting in the socket; others can't command anyway."""
         return self.pilot and bool(self.poll(0))
 
     def take_in(self) -> int:
@@ -184,7 +184,7 @@ class ServerConnection:
             try:
                 packet = self.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except OSError:
-                break  # the next reader gets it, too
+                break  # the next read returns it again
             if packet == packets.WAKE:
                 continue
             superseded += backlog.put(packet)
@@ -220,7 +220,7 @@ class ServerConnection:
     def hang_up(self, reason: str) -> None:
         """End the connection and send the reason to the application. Any thread.
 
-        The receiving thread notices this like any other end.
+        To the receiving thread, this is like any other end.
         """
         if not self.ending:
             self.reason = self.reason or reason
