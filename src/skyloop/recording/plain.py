@@ -304,8 +304,8 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 
 # Times ----------------------------------------------------------------------------------------------------------
 #
-# A sample's timestamp is when the proxy received it, on the proxy's clock, which is the time axis of a flight. The file's
-# own are on the recorder's clock; they are unrelated to the flight if a replay runs in step with its application.
+# A sample's timestamp is when the proxy received it, on the proxy's clock: the time axis of a flight. The file's
+# own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
 
 
 _BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is more than this before the newest one

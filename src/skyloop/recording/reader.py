@@ -90,8 +90,8 @@ class Series:
 class Recording:
     """An MCAP file recorded by Skyloop. Opening it reads the index or, if there is none, scans the file.
 
-    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is. Unreadable parts in the middle are
-    skipped, and ``damaged`` lists them.
+    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is.
+    Unreadable parts in the middle are skipped, and ``damaged`` lists them.
     """
 
     path: Path
