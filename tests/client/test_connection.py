@@ -315,7 +315,7 @@ def test_a_proxy_that_refuses(proxy: ScriptedProxy) -> None:
 def test_a_proxy_without_feedback(proxy: ScriptedProxy) -> None:
     proxy.beating.clear()
     proxy._ended.set()
-    with pytest.raises(NoAnswerError, match="scripted answered, but reported no vehicle state"):
+    with pytest.raises(NoAnswerError, match="scripted answered but reported no vehicle state"):
         open_drone(proxy.server.dial, app="me", timeout_s=0.1)
 
 

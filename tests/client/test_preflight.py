@@ -80,7 +80,7 @@ def test_a_ready_vehicle_has_only_good_findings() -> None:
         (replace(READY, link=LinkStatus(LinkState.LOST, LinkState.UP, "gone")), "link", Level.FAIL, "gone"),
         (replace(READY, link=LinkStatus(LinkState.UP, LinkState.CONNECTING)), "link", Level.FAIL, "vehicle"),
         (replace(READY, link=LinkStatus(LinkState.UP, LinkState.DEGRADED)), "link", Level.WARN, "degraded"),
-        (replace(READY, capabilities=Capabilities("video")), "vehicle", Level.FAIL, "takes no commands"),
+        (replace(READY, capabilities=Capabilities("video")), "vehicle", Level.FAIL, "accepts no commands"),
         (replace(READY, feedback=None), "vehicle", Level.FAIL, "not reported"),
         (fed(state=FlightState.EMERGENCY), "vehicle", Level.FAIL, "emergency stop"),
         (replace(READY, feedback_age_s=3.0), "vehicle", Level.FAIL, "3.0 s old"),

@@ -226,7 +226,7 @@ def test_values_as_types(proxy: ScriptedProxy, drone: Drone) -> None:
     [box] = result.to(list[Box])
     assert box.x == 1.0
     np.testing.assert_array_equal(box.corners, np.eye(2))
-    with pytest.raises(DecodeError, match="a result of detector is no dict"):
+    with pytest.raises(DecodeError, match="a result of detector is not a dict"):
         result.to(dict[str, float])
 
 

@@ -67,7 +67,7 @@ def test_a_flight_is_recorded_beside_its_picture_and_only_once(deck: Deck, tmp_p
     assert len(list(tmp_path.glob("large-*.mcap"))) == 1
     page.page.get_by_role("button", name="All drones").click()
     row = page.page.locator('[data-recording="broken.mcap"]')
-    page.until(lambda: "no MCAP file" in (row.text_content() or ""), "what is wrong with it")
+    page.until(lambda: "not an MCAP file" in (row.text_content() or ""), "what is wrong with it")
     assert not row.get_by_role("link", name="Report").is_visible(), "nothing of it can be read"
     row.get_by_role("button", name="More").click()
     assert row.get_by_role("button", name="Delete").is_visible()

@@ -212,6 +212,6 @@ def test_the_overview_is_sent_on_request(transport: tuple[TransportServer, Diale
 
 
 def test_a_proxy_that_sends_no_overview() -> None:
-    words = "a proxy of an earlier version sends none"
+    words = "older proxies send none"
     with scripted() as proxy, _observing(proxy) as drone, pytest.raises(NoAnswerError, match=words):
         drone.overview(0.05)

@@ -131,7 +131,7 @@ def test_a_place_on_the_earth(vehicle: str) -> None:
         latitude_deg, longitude_deg, _ = origin.place_of((x, y, z))
         drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, timeout_s=LONG_S)
         assert math.dist(place(drone.feedback()), (x, y, height_m)) <= 0.35, "it did not stay at its height"
-        with pytest.raises(UsageError, match=r"must be within 100000 m of the origin"):
+        with pytest.raises(UsageError, match=r"must be within 100000 m of the vehicle's origin"):
             drone.go_to(latitude_deg=0.0, longitude_deg=0.0)
 
 
@@ -199,7 +199,7 @@ def test_a_swarm_and_asyncio_fly_to_places() -> None:
         swarm.wait_all(lambda feedback: abs(place(feedback)[0] - homes["a"][0]) < 0.2, WAIT_S)
         with pytest.raises(UnknownNameError):
             swarm.go_to({"c": (0.0, 0.0, 1.0)})
-        with pytest.raises(UsageError, match=r"place of a is \(0\.0, 1\.0\) and must be x, y, z"):
+        with pytest.raises(UsageError, match=r"position of a is \(0\.0, 1\.0\) and must be x, y, z"):
             swarm.go_to({"a": (0.0, 1.0)})
         with pytest.raises(SwarmError, match=r"limits\.altitude"):
             swarm.go_to({"a": (0.0, 0.0, 60.0)})

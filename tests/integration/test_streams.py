@@ -238,7 +238,7 @@ def near() -> Iterator[Drone]:
         ({"encoding": "h264", "kbit_s": 1}, "kbit_s is 1 and must be a whole number of kbit/s from 30"),
         ({"encoding": "h264", "kbit_s": 500.0}, "must be a whole number"),
         ({"encoding": "h264", "part": (0, 2)}, "part is not possible"),
-        ({"encoding": "h264", "quality": 50}, "is of encoding"),
+        ({"encoding": "h264", "quality": 50}, "the encoding is"),
         ({"kbit_s": 500}, "kbit_s and subscriber need"),
     ],
 )

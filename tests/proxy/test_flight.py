@@ -95,7 +95,7 @@ def test_an_earlier_runs_flight_is_ours_if_found_in_the_air_but_no_later_one() -
     assert seen(flight, UNKNOWN) is Whose.NOBODYS
     changed = flight.observe(FLYING, "", T0)
     assert changed is not None
-    assert "restarted" in changed.why
+    assert "before its restart" in changed.why
     assert flight.ours
 
     landed_meanwhile = Flight()

@@ -115,7 +115,7 @@ def test_refused_targets_and_their_reasons(
     [
         (Position(50.0, 0.0, -3.0), START, "outside the room, box -4 -4 0 4 4 9 [m] (safety.room)"),
         (Position(0.0, 0.0, -0.2), START, "outside the room"),
-        (Position(0.0, 0.0, 8.0), START, "at most 5.00 m is allowed"),
+        (Position(0.0, 0.0, 8.0), START, "must be at most 5.00 m"),
     ],
 )
 def test_a_known_room_is_never_left(asked: Position, feedback: Feedback, words: str) -> None:
@@ -159,7 +159,7 @@ def test_repeats_follow_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -
 
 REFUSED = [
     (Position(3.5, 0.1, 1.0), "zone blocks the straight line"),
-    (Position(0.0, 0.0, 6.0), "at most 5.00 m is allowed"),
+    (Position(0.0, 0.0, 6.0), "must be at most 5.00 m"),
     (Position(-2.0, 0.0, -3.0), "3.00 m below the ground"),
 ]
 

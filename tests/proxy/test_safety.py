@@ -431,7 +431,7 @@ def test_a_zone_with_a_name_is_reported_by_it(bench: Bench) -> None:
     pilot.command(Attitude(pitch=0.3))
     told = pilot.told(EventKind.COMMAND_CLAMPED)
     assert {event.data.get("zone") for event in told if event.data["limit"] == ZONES} == {"tree"}
-    assert f"{ZONES} (tree) made" in next(event.text for event in told if event.data["limit"] == ZONES)
+    assert f"{ZONES} (tree) allows" in next(event.text for event in told if event.data["limit"] == ZONES)
     pilot.command(Position(2.0, 0.0, 1.0))
     assert "tree: cylinder" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
     bench.move((-1.8, 0.0, 1.0))

@@ -73,7 +73,7 @@ def test_damage_in_the_middle_is_left_out(tmp_path: Path) -> None:
 
 def test_a_whole_file_needs_nothing(log: Log, flight: Path) -> None:
     ended = log("recover", flight)
-    assert (ended.code, ended.err) == (0, f"{flight} is whole: there is nothing to repair\n")
+    assert (ended.code, ended.err) == (0, f"{flight} is complete: there is nothing to repair\n")
     assert not flight.with_name("flight-recovered.mcap").exists()
 
 

@@ -74,7 +74,7 @@ BAD = [
     ("", "key 'room': missing"),
     ("[room]\nsize = [8, 6", "not valid TOML"),
     ("[room]\nsize = [8, 6]\n", r"\[room\], key 'size': .* a list of 3 numbers"),
-    ("[room]\nsiez = [8, 6, 3]\n", "there is 'siez'; did you mean 'size'"),
+    ("[room]\nsiez = [8, 6, 3]\n", "found 'siez'; did you mean 'size'"),
     ("[room]\nsize = [8, 6, nan]\n", "'size': nan"),
     ("[room]\nsize = [8, 6, inf]\n", "'size': inf"),
     ("[room]\nsize = [8, -6, 3]\n", "'size': -6.* from 0.5 to 1000"),
@@ -137,7 +137,7 @@ BAD = [
     (ROOM + FACE, "'position': missing; .* or 'on' and 'at'"),
     (ROOM + "[[spawn]]\nposition = [0, 0, 0]\nyaw_deg = 400\n", "'yaw_deg': 400 .* a number from -360 to 360"),
     (ROOM + BOARD + "path = { speed = 1, radius = 1 }\n", "'kind': missing; it must be one of waypoints, circle"),
-    (ROOM + BOARD + "path = { knd = 'circle' }\n", "there is 'knd'; did you mean 'kind'"),
+    (ROOM + BOARD + "path = { knd = 'circle' }\n", "found 'knd'; did you mean 'kind'"),
     (ROOM + BOARD + "path = 3\n", r"\[target 'b'\], key 'path': 3 .* a table \[target 'b'.path\]"),
     (ROOM + BOARD + "size = [1, 1, 1]\npath = { kind = 'circle' }\n", "'size': unknown key"),
     (

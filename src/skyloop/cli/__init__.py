@@ -8,11 +8,11 @@ import threading
 from collections.abc import Sequence
 from typing import Final, NoReturn
 
-INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
+INTERRUPTED: Final = 130  #: 128 + SIGINT, the convention of shells
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; see :func:`skyloop.cli.app.main`. Ctrl-C also ends its imports."""
+    """Run the command line and exit; see :func:`skyloop.cli.app.main`. Ctrl-C works even during imports."""
     try:
         from skyloop.cli import app
 
@@ -22,9 +22,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def interrupt_by_signals(numbers: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM)) -> None:
-    """Raise KeyboardInterrupt on SIGTERM, and on SIGINT, which shells ignore for background jobs.
+    """Raise KeyboardInterrupt on SIGTERM, and also on SIGINT, which shells ignore for background jobs.
 
-    Does nothing on threads other than the main one.
+    On threads other than the main one, do nothing.
     """
 
     def interrupt(*_: object) -> NoReturn:

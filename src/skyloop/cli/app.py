@@ -1,4 +1,4 @@
-"""Assembles the commands, with plain-text help, and prints Skyloop's own errors as one clear line."""
+"""Assemble the commands, with plain-text help, and print Skyloop's own errors as one clear line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAILED: Final = 1
 USAGE_ERROR: Final = 2
 _WIDEST: Final = 80
 _NARROWEST: Final = 34
-_COLUMN: Final = 30  #: of the options; longer ones have their text on the next line
+_COLUMN: Final = 30  #: width of the column of options; longer options have their text on the next line
 _NARROW_COLUMN: Final = 8
 _KINDS: Final = (
     (re.compile(r"<(?:float|int)(?: range)?>"), "N"),
@@ -42,13 +42,13 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line. Only the modules of these commands are imported now, others on demand."""
+    """Return the command line. Only the modules of the given commands are imported now, all others on demand."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,
         add_completion=True,
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,  # plain help fits narrow terminals and pipes, and starts faster
+        rich_markup_mode=None,  # plain help fits into narrow terminals and pipes, and starts faster
         context_settings={"help_option_names": ["-h", "--help"], "terminal_width": width()},
     )
     app.callback()(_skyloop)
@@ -70,12 +70,12 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 
 def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
-    """Return a command class that hands over to one of these if it is the first word."""
+    """Return a command class that hands over to one of these commands if it is the first word."""
     return type("Behaviours", (WithBehaviours,), {"behaviours": {n: _alone(n, each) for n, each in entries.items()}})
 
 
 def _alone(name: str, entry: Entry) -> Any:
-    """Return one command from a separate command line."""
+    """Return one command as a command line of its own."""
     own = typer.Typer(add_completion=False, rich_markup_mode=None)
     function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
     own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
@@ -83,7 +83,7 @@ def _alone(name: str, entry: Entry) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit: 0 on success, 1 on failure, 2 for a wrong word or value."""
+    """Run the command line and exit with 0 on success, 1 on failure, or 2 for an invalid word or value."""
     given = with_place(sys.argv[1:] if arguments is None else arguments)
     if VERBOSE in given:
         given.remove(VERBOSE)
@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
-    """Run a command line under its name, and exit like :func:`main`."""
+    """Run a command line under the given name, and exit like :func:`main`."""
     make_printable()
     try:
         code = app(arguments, prog_name=name, standalone_mode=False)
@@ -106,7 +106,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
-    except ImportError as error:  # of a part that no module of Skyloop checks for
+    except ImportError as error:  # an import that no module of Skyloop checks for
         from skyloop.cli.install import missing
 
         entry = entry_of(arguments)
@@ -129,7 +129,7 @@ def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
 
 
 def log_to_stderr() -> None:
-    """Log Skyloop's own messages to standard error, with time and thread."""
+    """Log Skyloop's own messages to standard error, with time and thread name."""
     logging.basicConfig(
         level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s [%(threadName)s] %(message)s", stream=sys.stderr
     )
@@ -159,14 +159,14 @@ def _skyloop(
 
 
 def width() -> int:
-    """Return the width of help in columns: the terminal's, at most 80."""
+    """Return the width of help texts in columns: that of the terminal, but at most 80."""
     return max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns) - 2)
 
 
 class Command(TyperCommand):
-    """A command whose help shows its arguments as typed: ``NAME``, or ``[NAME]`` if optional.
+    """A command whose help shows its arguments the way they are typed: ``NAME``, or ``[NAME]`` if optional.
 
-    The ``metavar`` of an argument is shown verbatim: NAME is optional for Typer, because ``--drone`` may replace it.
+    An argument's ``metavar`` is shown verbatim: NAME is optional for Typer, because ``--drone`` may be used instead.
     """
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -179,7 +179,7 @@ class Command(TyperCommand):
 
 
 class WithBehaviours(Command):
-    """A command whose first word may name another command with its own options: ``skyloop fly follow``.
+    """A command whose first word may be another command with its own options: ``skyloop fly follow``.
 
     Attributes:
         behaviours: The other commands, by name.
@@ -188,7 +188,7 @@ class WithBehaviours(Command):
     behaviours: ClassVar[Mapping[str, Any]] = {}
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse the words for the command that they name."""
+        """Parse the words for the command that they select."""
         other = self.behaviours.get(args[0]) if args else None
         if other is None:
             return super().make_context(info_name, args, parent, **extra)
@@ -196,7 +196,7 @@ class WithBehaviours(Command):
 
 
 class Group(TyperGroup):
-    """A command with subcommands, listed with their whole summaries, wrapped if necessary."""
+    """A command with subcommands, listed with their full summaries, wrapped if necessary."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
@@ -215,16 +215,16 @@ class Group(TyperGroup):
 
 
 class ByTask(Group):
-    """All commands in the order of the table; each is created on demand."""
+    """All commands in the order of the table, each created on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
-        """Return the names of the commands in the order of the help."""
+        """Return the names of the commands in the order used in help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, creating it if necessary; None for an unknown one."""
+        """Return a command, creating it if necessary, or None if it is unknown."""
         if cmd_name not in COMMANDS:
-            for name in COMMANDS:  # Typer looks for similar names among these
+            for name in COMMANDS:  # Typer searches these for similar names
                 self.get_command(ctx, name)
         elif cmd_name not in self.commands:
             made: Any = typer.main.get_command(build([cmd_name]))
@@ -239,7 +239,7 @@ class ByTask(Group):
 
 
 def write_sections(formatter: Any, sections: Mapping[str, list[tuple[str, str]]]) -> None:
-    """Write commands and their summaries under titles, in the same columns."""
+    """Write commands and their summaries under titles, all in the same columns."""
     longest = max((len(name) for rows in sections.values() for name, _ in rows), default=0)
     for title, rows in sections.items():
         with formatter.section(title):
@@ -258,7 +258,7 @@ def argument_words(command: Any, ctx: Any) -> list[str]:
 
 
 def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return a command's words with their meanings, as ``Arguments`` and ``Options`` if there are any."""
+    """Return a command's words and their meanings, as ``Arguments`` and ``Options`` if it has any."""
     arguments, options = [], []
     for param in command.get_params(ctx):
         if param.param_type_name == "argument":
@@ -270,7 +270,7 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write arguments as their words only, and options with their values."""
+    """Write arguments as words only, and options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

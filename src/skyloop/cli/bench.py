@@ -1,4 +1,4 @@
-"""``skyloop bench``: measures this machine's delays beside those of a bare hand-over, and the simulator's speed."""
+"""``skyloop bench``: measures this machine's delays, next to those of a bare hand-over, and the simulator's speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def bench(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")] = False,
 ) -> None:
-    """Measure delays on this machine, as medians and 99th percentiles, or the speed of the simulator.
+    """Measure the delays on this machine (median and 99th percentile), or the speed of the simulator.
 
     Close all other programs first.
     """
@@ -62,7 +62,7 @@ def bench(
 
 
 def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> list[tuple[int, int]]:
-    """Parse sizes of frames such as ``320x240,640x480``.
+    """Parse frame sizes such as ``320x240,640x480``.
 
     Raises:
         UsageError: The text is not a list of sizes.
@@ -78,7 +78,7 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
 
 
 def delay_table(results: DelayResults) -> Table:
-    """Return a table of the delays beside those of the bare hand-over."""
+    """Return a table of the delays, next to those of the bare hand-over."""
     rows = [
         (
             f"{row.channel} {row.size}" if row.channel == "video" else row.channel,
@@ -95,7 +95,7 @@ def delay_table(results: DelayResults) -> Table:
 
 
 def physics_table(results: SimResults) -> Table:
-    """Return a table for flying without pictures."""
+    """Return a table for flights without images."""
     rows = [
         (
             str(row.drones),
@@ -111,7 +111,7 @@ def physics_table(results: SimResults) -> Table:
 
 
 def drawing_table(results: SimResults) -> Table:
-    """Return a table for pictures with the sensor's flaws."""
+    """Return a table for images that include the sensor's flaws."""
     rows = [
         (
             row.cameras,

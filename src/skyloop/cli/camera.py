@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from skyloop.calibration import Calibration
     from skyloop.vision.calibrating import Board, BoardFinder, BoardView, Collector
 
-    Picture = tuple[str, NDArray[np.uint8]]  # name and pixels
+    Picture = tuple[str, NDArray[np.uint8]]  # name and image
 
 camera = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop camera "
-_MAX_BYTES: Final = 256 << 20  #: of an image file
+_MAX_BYTES: Final = 256 << 20  #: maximum size of an image file
 _PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _GOOD_COVERAGE: Final = 0.5
 _GOOD_RMS_PX: Final = 1.0
-_PATIENCE_S: Final = 10.0  # without a frame
+_PATIENCE_S: Final = 10.0  # maximum time to wait for a frame
 
 
 class Kind(StrEnum):
@@ -102,10 +102,10 @@ def calibrate(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Find a camera's focal length, principal point and distortion, and write them as JSON.
+    """Find a camera's focal length, principal point and distortion, and write them to a JSON file.
 
-    Show the board near and far, in all corners of the picture, and tilted. Views that differ are taken
-    automatically; Ctrl-C ends that early.
+    Show the board near and far, in all corners of the picture, and tilted. Views that differ enough are taken
+    automatically; press Ctrl-C to stop early.
     """
     from skyloop.vision.calibrating import BoardFinder
     from skyloop.vision.calibrating import calibrate as fit
@@ -146,17 +146,17 @@ def list_cameras() -> None:
 
 
 class _Search:
-    """Searches one picture after another for the board."""
+    """Searches pictures for the board, one after another."""
 
     def __init__(self, finder: BoardFinder, most: int) -> None:
-        self.every = False  #: take every view, as of single pictures; of a stream only differing views are taken
+        self.every = False  #: take every view, which is right for single pictures; in a stream, only differing ones are
         self.collector: Collector | None = None
         self.looked = 0
         self._finder = finder
         self._most = most
 
     def run(self, pictures: Iterable[Picture], found: Callable[[Any, BoardView], None] | None = None) -> None:
-        """Search until the pictures end, enough views are found, or Ctrl-C. :class:`UsageError` for other sizes."""
+        """Search until the pictures end, enough views are found, or Ctrl-C. :class:`UsageError` if sizes differ."""
         from skyloop.vision.calibrating import Collector
 
         try:
@@ -215,7 +215,7 @@ def _are_files(source: list[str]) -> bool:
     """Return whether the sources are files.
 
     Raises:
-        UsageError: Only some of them are.
+        UsageError: Some are files and some are not.
     """
     files = [Path(name).is_file() for name in source]
     if any(files) and not all(files):
@@ -249,7 +249,7 @@ def _from_picture(cv: Any, name: str) -> Any:
 
     content = read_bytes(name, "the picture", _MAX_BYTES)
     picture = None
-    if image_size(content) is None or not why_not_decoded(content):  # OpenCV limits the others
+    if image_size(content) is None or not why_not_decoded(content):  # OpenCV itself limits the size of other formats
         picture = cv.imdecode(np.frombuffer(content, np.uint8), cv.IMREAD_COLOR) if content else None
     if picture is None:
         raise UsageError(f"{name} can't be read as an image")
@@ -272,7 +272,7 @@ def _from_video(cv: Any, name: str) -> Iterator[Picture]:
 
 
 class _Vehicle:
-    """A vehicle's camera, for a limited time; a context manager."""
+    """A vehicle's camera, used for a limited time; a context manager."""
 
     def __init__(self, source: str, camera: str | None, seconds: float) -> None:
         from skyloop.client import connect
@@ -291,7 +291,7 @@ class _Vehicle:
         self._drone.close()
 
     def pictures(self) -> Iterator[Picture]:
-        """Yield the newest frames until the time is over or none arrive."""
+        """Yield the newest frames until the time is over or no more arrive."""
         end = time.monotonic() + self._seconds
         try:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
@@ -303,7 +303,7 @@ class _Vehicle:
             tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
-        """Show the found board in the cockpit."""
+        """Show the board that was found in the cockpit."""
         from skyloop.messages import Points
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)

@@ -71,7 +71,7 @@ def cockpit(
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
-    It admits only programs of the same user on this machine, unless tokens or certificates admit others.
+    Only programs of the same user on this machine are admitted, unless tokens or certificates admit others.
     """
     from skyloop.cockpit import Access, serve_cockpit, with_certificate
     from skyloop.network.config import choose

@@ -1,6 +1,6 @@
-"""The commands of ``skyloop``, grouped by task, a line for each. A new command is one more line here.
+"""All commands of ``skyloop``, grouped by task, one line each. To add a command, add a line.
 
-Help and error messages come from this table; the module of a command is imported when the command is used.
+Help and error messages are based on this table; a command's module is imported when the command is used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 
 class Task(StrEnum):
-    """A kind of task, in the order of ``skyloop --help``."""
+    """A group of commands, in the order of ``skyloop --help``."""
 
     FLY = "Fly"
     SEE = "See"
@@ -22,15 +22,15 @@ class Task(StrEnum):
 
 
 class Entry(NamedTuple):
-    """One command: the place of its function, its line in the list of commands, an example and its requirements."""
+    """One command: where its function is, its line in the list of commands, an example and what it requires."""
 
     task: Task
-    home: str  # module of skyloop.cli, and function
+    home: str  # module in skyloop.cli, and function
     summary: str  # up to 60 characters, so that the list fits into 80 columns
     example: str
-    extras: tuple[str, ...] = ()  # optional parts that it needs; an error names all that are missing
+    extras: tuple[str, ...] = ()  # optional parts that it needs; an error names all missing ones
     settings: Mapping[str, Any] = {}
-    behaviours: Mapping[str, Entry] = {}  # commands that replace it if they are its first word
+    behaviours: Mapping[str, Entry] = {}  # commands that replace it if one of them is the first word
 
     @property
     def module(self) -> str:
@@ -39,7 +39,7 @@ class Entry(NamedTuple):
 
     @property
     def function(self) -> str:
-        """The name of the function, or of a :class:`typer.Typer` with subcommands."""
+        """The name of the function, or of a :class:`typer.Typer` that has subcommands."""
         return self.home.partition(":")[2]
 
 
@@ -164,7 +164,7 @@ COMMANDS: Final = {
 
 
 def entry_of(words: Sequence[str]) -> Entry | None:
-    """Return the command named by the words of a command line; None if there is none or it is unknown."""
+    """Return the command selected by the words of a command line, or None if there is none or it is unknown."""
     plain = [word for word in words if not word.startswith("-")]
     entry = COMMANDS.get(plain[0]) if plain else None
     return entry if entry is None or len(plain) < 2 else entry.behaviours.get(plain[1], entry)

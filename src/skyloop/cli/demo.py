@@ -1,4 +1,4 @@
-"""``skyloop demo``: a simulated drone finds a marker and follows it by its camera, and reports how well."""
+"""``skyloop demo``: a simulated drone finds a marker, follows it by camera, and reports how well it did."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
     from skyloop.control.follow import FollowMarker, FollowScore
 
-MARKER_ID = 7  #: on the board carried around the room
+MARKER_ID = 7  #: marker on the board carried around the room
 ENOUGH_IN_VIEW = 0.9
 _REFRESH_HZ = 4
 _FIRST_PICTURE_S: Final = 10.0
 
-#: The port option of a demonstration.
+#: The option for a demonstration's port.
 PagePort = Annotated[
     int | None, typer.Option(min=0, max=65535, help="Port of the page; 0: any free one [8420, or the next free one]")
 ]
-#: Native telemetry with a simulated vehicle's true position and that of the board, in world axes [m].
+#: Native telemetry with the true positions of a simulated vehicle and of the board, in world axes [m].
 OWN_PLACE = ("truth.x", "truth.y", "truth.z")
 BOARD_PLACE = ("truth.target.x", "truth.target.y", "truth.target.z")
-SETTLING_S = 5.0  # after the first sighting the vehicle is still approaching the marker
+SETTLING_S = 5.0  # time after the first sighting during which the vehicle is still approaching the marker
 
 
 def demo(
@@ -78,7 +78,7 @@ def _address(world: str, seed: int) -> str:
 
 @dataclass(slots=True)
 class _Demo:
-    """One run, from connecting to landing."""
+    """One run of the demonstration, from connecting to landing."""
 
     console: Console
     name: str
@@ -88,7 +88,7 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
-        """Fly it; ``port`` None: the default port of pages. Raises the errors of connecting and of take-off."""
+        """Fly the demonstration; ``port`` None: the default port for pages. Raise errors of connecting and take-off."""
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
@@ -126,7 +126,7 @@ class _Demo:
             follower.run(seconds=self.seconds, until=lambda: self._stopped)
 
     def _stop(self) -> None:
-        """End the flight in good order on the first Ctrl-C. A second one interrupts Python as usual."""
+        """End the flight properly on the first Ctrl-C. A second one interrupts Python as usual."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
@@ -166,22 +166,22 @@ def drone_and_page(
     page_shown: bool,
     browser: bool,
 ) -> Iterator[tuple[Drone, CockpitProcess | None, float]]:
-    """Connect to a vehicle, wait for its first picture, and show the page.
+    """Connect to a vehicle, wait for its first image, and show the page.
 
     Args:
         uri: The vehicle's address.
-        console: For the output.
-        name: Name of the pilot, as shown to others.
+        console: The console for output.
+        name: The pilot's name as shown to others.
         stop: Called on the first Ctrl-C.
         port: The page's port; None: the default one.
-        page_shown: Whether there is a page.
-        browser: Whether to open it in the browser.
+        page_shown: Whether to show a page.
+        browser: Whether to open the page in the browser.
 
     Yields:
-        The drone, the page if there is one, and the time of the first picture (monotonic) [s].
+        The drone, the page if there is one, and the time of the first image (monotonic) [s].
 
     Raises:
-        SkyloopError: Any error of connecting.
+        SkyloopError: Connecting failed.
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess
@@ -199,7 +199,7 @@ def drone_and_page(
 
 
 def _show(page: CockpitProcess, console: Console, browser: bool) -> None:
-    """Print the page's address, and open it; without the page a demonstration continues."""
+    """Print the page's address and open the page. If there is no page, the demonstration continues."""
     try:
         address = page.address()
     except LinkError as error:
@@ -211,7 +211,7 @@ def _show(page: CockpitProcess, console: Console, browser: bool) -> None:
 
 
 def land(drone: Drone, console: Console) -> None:
-    """Land, unless another application flies the drone."""
+    """Land, unless another application is flying the drone."""
     status = drone.authority
     if status.state != "held":
         console.print(f"[yellow]{status.holder or 'another application'} took over: leaving the drone to it[/]")
@@ -222,7 +222,7 @@ def land(drone: Drone, console: Console) -> None:
 
 @contextmanager
 def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` on SIGINT and SIGTERM; a second one has its previous effect."""
+    """Call ``stop`` on the first SIGINT or SIGTERM; a second one has its previous effect."""
     before: dict[int, Any] = {}
 
     def put_back() -> None:
@@ -244,7 +244,7 @@ def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Statistics of range errors [m]."""
+    """Statistics of distance errors [m]."""
 
     rms: float
     mean: float
@@ -253,7 +253,7 @@ class Spread:
 
     @classmethod
     def of(cls, errors: list[float]) -> Spread | None:
-        """Return the statistics of errors; None if there are none."""
+        """Return the statistics of the errors, or None if there are none."""
         if not errors:
             return None
         n = len(errors)
@@ -264,7 +264,7 @@ class Spread:
 
 
 def true_range(native: dict[str, Value] | None) -> float | None:
-    """Return the true distance from the vehicle's centre to the carried board's [m]; None if unknown."""
+    """Return the true distance between the centres of the vehicle and the carried board [m]; None if unknown."""
     if native is None:
         return None
     places = [[native.get(name) for name in names] for names in (OWN_PLACE, BOARD_PLACE)]
@@ -273,7 +273,7 @@ def true_range(native: dict[str, Value] | None) -> float | None:
 
 
 class TruthMeter:
-    """Compares the true distance with the desired one while the marker is followed, within a ``with`` block."""
+    """Compares the true distance to the desired one while the marker is followed, within a ``with`` block."""
 
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:
         self.errors_m: list[float] = []
@@ -298,10 +298,10 @@ class TruthMeter:
 
 @dataclass(slots=True)
 class DemoReport:
-    """The figures of a demonstration, and their table."""
+    """The results of a demonstration, and their table."""
 
-    first_picture_s: float | None = None  #: from the start of the demo
-    frames: int = 0  #: since the marker was first seen
+    first_picture_s: float | None = None  #: measured from the start of the demo
+    frames: int = 0  #: number since the marker was first seen
     share_in_view: float | None = None
     estimated: Spread | None = None
     true: Spread | None = None
@@ -310,7 +310,7 @@ class DemoReport:
     collisions: int = 0
 
     def take(self, drone: Drone, score: FollowScore, truth: TruthMeter, page: dict[str, Any] | None) -> None:
-        """Record everything that must be read while the drone is connected."""
+        """Record everything that must be read while the drone is still connected."""
         self.frames = score.frames
         self.share_in_view = score.share_in_view
         self.estimated = Spread.of(score.range_errors_m(SETTLING_S))
@@ -319,17 +319,17 @@ class DemoReport:
         self.page = page
 
     def good(self, enough: float) -> bool:
-        """Return whether the marker was found, and in view for at least this share of the frames since."""
+        """Return whether the marker was found, and was then in view in at least this fraction of the frames."""
         return self.share_in_view is not None and self.share_in_view >= enough
 
     def verdict(self, enough: float) -> str:
-        """Return the reason for a bad result."""
+        """Return why the result is bad."""
         if self.share_in_view is None:
             return "the marker was never seen"
         return f"the marker was in view in {self.share_in_view:.1%} of the frames, less than {enough:.0%}"
 
     def table(self) -> Table:
-        """Return the figures as a table for the terminal."""
+        """Return the results as a table for the terminal."""
         table = Table(title="The flight", title_justify="left", show_header=False, box=None)
         seen = "never seen" if self.share_in_view is None else f"{self.share_in_view:.1%} of {self.frames} frames"
         rows = [
@@ -354,7 +354,7 @@ def _spread_text(spread: Spread | None) -> str:
 
 
 def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
-    """Return the row of a channel; none for an unused one."""
+    """Return a channel's row; none if the channel is unused."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

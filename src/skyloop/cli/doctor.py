@@ -1,7 +1,7 @@
 """Check-ups: ``skyloop doctor`` checks this machine or one vehicle, ``skyloop preflight`` a drone before a flight.
 
-``skyloop doctor`` lists what works and what to install for the rest; ``skyloop doctor ADDRESS`` connects to one vehicle
-and lists the settings that need attention. None of them flies anything.
+``skyloop doctor`` lists what works and what must be installed for the rest; ``skyloop doctor ADDRESS`` connects to one
+vehicle and lists the settings that need attention. None of them flies the vehicle.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 IMPORT_BUDGET_S: Final = 0.3
 
-#: Ports that Skyloop listens on or vehicles send to, with their purposes.
+#: Ports that Skyloop listens on or that vehicles send to, and their purposes.
 PORTS: Final = (
     ("UDP", 14550, "MAVLink ground stations"),
     ("UDP", 14540, "PX4"),
@@ -47,25 +47,25 @@ PORTS: Final = (
     ("UDP", 5554, "AR.Drone's navdata"),
     ("TCP", 7447, "routers"),
 )
-ANSWER_S: Final = 3.5  #: for a vehicle to answer; chosen so that the user gets a result within 5 s
-PATIENCE_S: Final = 40.0  #: for reading a vehicle that answers
+ANSWER_S: Final = 3.5  #: time for a vehicle to answer; chosen so that the user gets a result within 5 s
+PATIENCE_S: Final = 40.0  #: time for reading from a vehicle that answers
 FEEDBACK_S: Final = 3.0
-SETTLE_S: Final = 2.0  #: for faults that end with our first messages, such as a receiver without sticks
+SETTLE_S: Final = 2.0  #: time for faults to clear that our first messages end, such as a receiver without sticks
 LOOK_S: Final = 0.1
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
 STATE_S = 2.0
-VIDEO_S = 5.0  #: a vehicle just started, such as a Tello, sends its first picture after some seconds
+VIDEO_S = 5.0  #: for the first picture, which a vehicle just started, such as a Tello, sends after some seconds
 
 
 class Health(StrEnum):
     GOOD = "good"
-    MISSING = "missing"  #: works without it
+    MISSING = "missing"  #: everything else works without it
     BAD = "bad"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A line of the report, with a line of advice if there is any."""
+    """One line of the report, followed by a line of advice if there is any."""
 
     what: str
     health: Health
@@ -77,7 +77,7 @@ MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow")
 
 
 def as_text(finding: Finding) -> Text:
-    """Return a finding as text for people."""
+    """Return a finding as text for users."""
     mark, colour = MARKS[finding.health]
     text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
     return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text
@@ -107,7 +107,7 @@ def doctor(
 
 
 def examine() -> Iterator[Finding]:
-    """Yield all findings in reading order. A check that breaks is a finding too."""
+    """Yield all findings in reading order. A check that breaks is itself a finding."""
     from skyloop.errors import MissingExtraError
 
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
@@ -193,7 +193,7 @@ def _extras() -> Iterator[Finding]:
                 versions.append(f"{module} {getattr(importlib.import_module(module), '__version__', '')}".strip())
             except ModuleNotFoundError:
                 missing.append(module)
-            except ImportError as error:  # it is installed, but one of its requirements is not
+            except ImportError as error:  # the package is installed, but one of its requirements is not
                 broken.append(f"{module}: {error}")
         if broken:
             yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --anew")
@@ -253,9 +253,9 @@ def _ports() -> Iterator[Finding]:
 
 
 def _free(kind: str, port: int) -> bool:
-    """Return whether a program could listen there."""
+    """Return whether a program could listen on this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
-        if kind == "TCP":  # as servers do, so that a port just closed counts as free
+        if kind == "TCP":  # like servers, so that a recently closed port counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", port))
@@ -299,7 +299,7 @@ def _proxies() -> Iterator[Finding]:
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """Return the findings in reading order.
+    """Return the findings about a vehicle in reading order.
 
     Raises:
         SkyloopError: The address is invalid.

@@ -1,4 +1,4 @@
-"""``skyloop land``, ``return`` and ``stop``: end the flight of one drone or of all from any terminal."""
+"""``skyloop land``, ``return`` and ``stop``: end the flight of one drone, or of all, from any terminal."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from skyloop.extend import Known, connect_to_stop, let_go
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-FRESH_S: Final = 1.0  #: maximum age of a trusted state
-LANDING_S: Final = 60.0  #: longest wait for a landing
-RETURN_S: Final = 600.0  #: longest wait for a return
-STOPPING_S: Final = 3.0  #: how long a stop is repeated until the vehicle reports it
+FRESH_S: Final = 1.0  #: maximum age of a state that can be trusted
+LANDING_S: Final = 60.0  #: maximum time to wait for a landing
+RETURN_S: Final = 600.0  #: maximum time to wait for a return
+STOPPING_S: Final = 3.0  #: time for which a stop is repeated until the vehicle reports it
 _REPEAT_S: Final = 0.1
 LEAVE: Final = "take over with --priority 0, or ask them"
 
@@ -38,11 +38,11 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array o
 
 
 class Ending(msgspec.Struct, frozen=True):
-    """The outcome of ending one drone's flight."""
+    """How ending one drone's flight turned out."""
 
     name: str
     ok: bool
-    outcome: str  #: how it ended, or why it did not, in words
+    outcome: str  #: how the flight ended, or why it did not
 
 
 def land(
@@ -56,8 +56,8 @@ def land(
 ) -> None:
     """Land drones, and wait until they have landed.
 
-    A drone flown by another application is not touched, but named, unless --priority is higher (a lower number). With
-    --all everything lands except drones flown with the highest priority. Exit code 1 if one has not landed.
+    A drone flown by another application is reported and left alone, unless --priority is higher (a lower number). With
+    --all, every drone lands except those flown with the highest priority. Exit code 1 if a drone has not landed.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -79,12 +79,12 @@ def return_to_start(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Fly drones back to their place of take-off, land there, and wait until they have landed.
+    """Fly drones back to their take-off positions, land there, and wait until they have landed.
 
-    Each climbs first, flies straight over its start and lands; nothing keeps several apart on the way. A drone
-    flown by another application is not touched, but named, unless --priority is higher (a lower number). Exit code 1 if
-    one has not landed at its start: such a drone, and every one after Ctrl-C, hovers and lands 5 s later if nobody
-    flies it.
+    Each drone climbs, flies straight to a point above its start and lands; nothing keeps several drones apart on the
+    way. A drone flown by another application is reported and left alone, unless --priority is higher (a lower number).
+    Exit code 1 if a drone has not landed at its start: such a drone, and every drone after Ctrl-C, hovers, then lands 5
+    s later if nobody flies it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -113,7 +113,7 @@ def stop(
 ) -> None:
     """Emergency stop: cut the motors at once. The drones FALL.
 
-    It works whoever flies, and asks first, except with --yes. Exit code 1 if a drone has not confirmed it.
+    This works no matter who flies, and asks first, except with --yes. Exit code 1 if a drone has not confirmed it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:
@@ -154,9 +154,9 @@ def _each(
     json: bool,
     interrupted: Callable[[], None] = lambda: None,
 ) -> None:
-    """End all flights in parallel, and print a line for each as soon as it has ended, or all as JSON.
+    """End all flights in parallel. Print a line for each as soon as it has ended, or everything as JSON.
 
-    ``interrupted`` is called on Ctrl-C, and must make each ``end`` return or raise.
+    ``interrupted`` is called on Ctrl-C; it must cause each ``end`` to return or raise.
     """
 
     def attempt(name: str) -> Ending:
@@ -202,7 +202,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether its pilot lands it, such as another ``skyloop land`` of the same priority; waits for it."""
+    """Return whether its pilot lands it, such as another ``skyloop land`` with the same priority; wait for that."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 
@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover, and begin no more returns."""
+    """Hover, and start no more returns."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 
@@ -234,7 +234,7 @@ def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]
 
 
 def _over_already(name: str, program: str) -> str:
-    """Return in words why there is no flight to end; empty if there is one."""
+    """Return why there is no flight to end; empty if there is one."""
     from skyloop.client import connect
 
     with connect(name, access="observe", name=program) as seen:
@@ -244,7 +244,7 @@ def _over_already(name: str, program: str) -> str:
 
 
 def _stop(name: str) -> str:
-    """Cut the motors. Needs no authority, and waits only for the connection."""
+    """Cut the motors. This needs no authority, and waits only for the connection."""
     from skyloop.messages import FlightState
 
     with closing(connect_to_stop(name, "skyloop stop")) as drone:
@@ -262,7 +262,7 @@ def _stop(name: str) -> str:
 
 
 def _on_the_ground(drone: Drone) -> bool:
-    """Return whether a recent state shows it on the ground."""
+    """Return whether a recent state shows the vehicle on the ground."""
     from skyloop.messages import FlightState
 
     try:

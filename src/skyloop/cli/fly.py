@@ -1,4 +1,4 @@
-"""``skyloop fly``: flies a controller from a file, and reports its progress and errors."""
+"""``skyloop fly``: flies a controller loaded from a file, and reports its progress and errors."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 )
 Make = Callable[[type["Controller"]], "Controller"]
-_LOOK_S: Final = 0.1  #: between checks that the drone is still there, while waiting for a corrected file
+_LOOK_S: Final = 0.1  #: interval between checks that the drone is still there, while waiting for a corrected file
 REFRESH_HZ: Final = 4
-LINE_EVERY_S: Final = 5.0  #: if standard error is not a terminal
+LINE_EVERY_S: Final = 5.0  #: used if standard error is not a terminal
 
 
 def fly(
@@ -60,7 +60,7 @@ def fly(
     ],
     name: OptionalNameArgument = None,
     drone: DroneOption = None,
-    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # the former name
+    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # a former name
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
@@ -92,7 +92,7 @@ def fly(
 
     join_network(network, keys)
     target = one_drone(name, drone or on, default="sim://")
-    if reload:  # a module saved twice within a second would come from Python's cache
+    if reload:  # otherwise a module saved twice within a second would be loaded from Python's cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
     reloader = Reloader(file, class_name) if reload else None
@@ -110,7 +110,7 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
     """Create the user's controller, and report methods that look like misspelt callbacks.
 
     Raises:
-        UsageError: The class can't be created from a drone alone.
+        UsageError: The class can't be created with a drone as its only argument.
     """
     from skyloop.control.controller import misspelt
 
@@ -142,14 +142,14 @@ def run(
 
     Args:
         flight: The flight to run.
-        drone: Connected as a pilot.
-        seconds: The duration; None until it ends, or Ctrl-C.
-        reloader: Reloads its file; None: never reload.
+        drone: The drone, connected as a pilot.
+        seconds: The duration; None: until the controller ends, or Ctrl-C.
+        reloader: Reloads the controller's file; None: never reload.
         takeoff: Whether to take off from the ground.
-        progress: Shows the progress; None: the default for flights.
+        progress: Shows the progress; None: the default display for flights.
 
     Returns:
-        Whether it ended as intended. Errors of the take-off are raised; those of the controller are shown.
+        Whether the flight ended as intended. Errors during take-off are raised; those in the controller are shown.
     """
     progress = progress or FlightProgress(drone)
     try:
@@ -168,7 +168,7 @@ def run(
 
 
 def land(drone: Drone) -> None:
-    """End the flight: land if it is in the air and under our control. A second interrupt leaves it to the proxy."""
+    """End the flight: land if in the air and under our control. A second interrupt leaves that to the proxy."""
     try:
         problem = end_flight(drone, say)
     except KeyboardInterrupt:
@@ -184,7 +184,7 @@ def say(text: str) -> None:
 
 
 class Flight:
-    """Runs a connected drone's controller to its end, and its replacements when the file is saved. Use once."""
+    """Runs a connected drone's controller to its end, and replaces it whenever the file is saved. Use only once."""
 
     def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
         self._drone = drone
@@ -192,7 +192,7 @@ class Flight:
         self._report = report
 
     def run(self, seconds: float | None) -> bool:
-        """Run the controller for this time, or to its end. Return False after an error; it then hovers."""
+        """Run the controller for this long, or until it ends. After an error, hover and return False."""
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -203,20 +203,20 @@ class Flight:
         return True
 
     def report_notes(self) -> None:
-        """Show probable mistakes of a run that ended without a summary."""
+        """Report probable mistakes in a run that ended without a summary."""
         checks = self._controller._checks
         for note in () if checks is None else checks.notes():
             self._report(f"note: {note}")
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
-        """Run the controller; a saved file takes over in flight, and after a failure it hovers until the next save."""
+        """Run the controller. A saved file takes over in flight; after a failure, hover until the next save."""
         deadline = math.inf if seconds is None else time.monotonic() + seconds
         while True:
             try:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
-                self._cancel(Known(self._drone).listeners)  # they would continue to fly
+                self._cancel(Known(self._drone).listeners)  # otherwise they would continue to fly
                 let_go(self._drone, "the controller failed")
                 self._report(what_failed(error))
                 self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
@@ -230,7 +230,7 @@ class Flight:
                 self._report("the saved file is not used: the previous one keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
-        """Hover until a file that can be flown is saved; False if the time ends or the drone is gone first."""
+        """Hover until a file that can be flown is saved; return False if the time ends or the drone is gone first."""
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False
@@ -238,7 +238,7 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Replace the present controller with the loaded one, if possible; the one that loses commands no more."""
+        """Replace the current controller with the loaded one, if possible. The old one can't command any more."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:
@@ -262,9 +262,9 @@ class Flight:
 
 
 def what_failed(error: Exception) -> str:
-    """Return what a person needs to fix an error: their own line, then the traceback without Skyloop's lines.
+    """Return what the user needs to fix an error: their own line, then the traceback without Skyloop's lines.
 
-    An error raised by Skyloop on purpose, without a line of the user's, is one line; any other is shown in full.
+    An error raised deliberately by Skyloop, with no line of the user's, becomes one line; any other is shown in full.
     """
     home = str(Path(__file__).parents[1])
     trace = traceback.TracebackException.from_exception(error)
@@ -281,7 +281,7 @@ def what_failed(error: Exception) -> str:
 
 
 def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
-    """Return the innermost line outside of Skyloop and libraries, or else the innermost outside of Skyloop."""
+    """Return the innermost line outside Skyloop and libraries, or, if there is none, the innermost outside Skyloop."""
     theirs = [line for line in stack if not line.filename.startswith(home)]
     libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
     return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])
@@ -292,9 +292,9 @@ class FlightProgress:
 
     Args:
         drone: The drone.
-        live: Whether to update one line in place; None: if standard error is a terminal.
-        what: Returns the beginning of the line: the state of the flight.
-        every_s: How often to print a line if standard error is not a terminal; None: :data:`LINE_EVERY_S`.
+        live: Whether to update one line in place; None: only if standard error is a terminal.
+        what: Returns the state of the flight, shown at the beginning of the line.
+        every_s: Interval between lines if standard error is not a terminal; None: :data:`LINE_EVERY_S`.
     """
 
     def __init__(
@@ -322,11 +322,11 @@ class FlightProgress:
                 console=Console(stderr=True),
                 refresh_per_second=REFRESH_HZ,
                 transient=True,
-                redirect_stdout=sys.stdout.isatty(),  # the controller's output appears above the line
+                redirect_stdout=sys.stdout.isatty(),  # so that the controller's output appears above the line
             )
 
     def line(self) -> str:
-        """Return the present progress, most important first: a narrow terminal cuts the end."""
+        """Return the current progress, most important first, because a narrow terminal cuts off the end."""
         line = flight_line(self._drone, time.monotonic() - self._begun_s)
         return line if self._what is None else f"{self._what()}  {line}"
 

@@ -1,4 +1,4 @@
-"""``skyloop fly follow``: follows the target in a box of the image, or one of a class."""
+"""``skyloop fly follow``: follows the target in a box drawn on the image, or a target of a given class."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skyloop.vision.tracking import Box
 
 SIMULATED: Final = "sim://?world=park&cameras=front&fps=15"
-#: As seen from the target, counter-clockwise from its direction of motion.
+#: Directions as seen from the target, counter-clockwise from its direction of motion.
 SIDES: Final = {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
 _RESULT_WITHIN_S: Final = 3.0
 _FIRST_FRAME_S: Final = 10.0
@@ -128,7 +128,7 @@ def _box(text: str) -> Box:
 
 
 def _detector(given: str, class_name: str | None) -> OnnxDetector | str:
-    """Return the detector in a file, or the name of a processor."""
+    """Return the detector loaded from a file, or the name of a processor."""
     from skyloop.vision import OnnxDetector
 
     if not given.endswith(".onnx") and "/" not in given and not Path(given).is_file():
@@ -158,7 +158,7 @@ def _check_class(detector: OnnxDetector, class_name: str | None, where: str) -> 
 
 
 def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDetector | str | None) -> None:
-    """Refuse on the ground what would end the flight in the air."""
+    """Refuse, while still on the ground, anything that would end the flight in the air."""
     from skyloop.vision.tracking import checked_box
 
     if box is not None:
@@ -174,7 +174,7 @@ def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDete
 
 
 def status_line(pilot: FollowTarget) -> str:
-    """Return the state of following in one line: the target's phase, its place, and its certainty."""
+    """Return the state of following in one line: the target's phase, its position, and how certain it is."""
     status = pilot.status
     parts = [
         status.phase,

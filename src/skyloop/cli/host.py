@@ -1,4 +1,4 @@
-"""``skyloop proxy`` serves one vehicle as a node, ``skyloop host`` many from one process."""
+"""``skyloop proxy`` serves one vehicle as a node; ``skyloop host`` serves many from one process."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def proxy(
 ) -> None:
     """Serve one vehicle to applications, until Ctrl-C, which lands it first.
 
-    Serves applications on this host, and with --network also on others.
+    Serves applications on this host and, with --network, on others too.
     """
     from skyloop.child_process import handed_over
     from skyloop.drivers.uri import parse_uri
@@ -153,7 +153,7 @@ def remove(
 ) -> None:
     """Land a vehicle of a running host, and stop serving it.
 
-    Refused while the vehicle flies and an application has the authority, unless --land is given.
+    Refused while the vehicle flies under an application's authority, unless --land is given.
     """
     from skyloop.host.serve import Remove
 
@@ -162,7 +162,7 @@ def remove(
 
 
 def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
-    """Return the rows as a text table, with the reason last because it may be long."""
+    """Return the rows as a text table. The reason comes last, because it may be long."""
     if not rows:
         return ["This host has no vehicle. Add one: skyloop host add NAME ADDRESS"]
     cells = [("NAME", "ADDRESS", "PROXY", "PROCESS", "STATE", "LINK", "BATTERY", "PILOT", "UP", "WHY")]
@@ -201,7 +201,7 @@ def _ask(request: Request, host: str | None, group: str | None) -> Answer:
 
 
 def _prepare(fleet: Fleet) -> None:
-    """Warn about an open network, and make room for the threads of simulators in this process."""
+    """Warn about an open network, and prepare this process for the threads of simulators."""
     from skyloop.cli.network import settle, warn_if_open
     from skyloop.host.vehicle import network_of
     from skyloop.vehicles.sim.options import options_of

@@ -1,6 +1,6 @@
-"""``skyloop install``: installs optional parts into this environment, and reports the missing ones.
+"""``skyloop install``: installs optional parts into this environment, and reports missing ones.
 
-No single pip spelling of an extra is right for a checkout, a wheel and a release. The requirements are therefore read
+No single way of naming an extra to pip works for a checkout, a wheel and a release. The requirements are therefore read
 from the package's own metadata, which all three have.
 """
 
@@ -19,7 +19,7 @@ import typer
 
 from skyloop.errors import SkyloopError, UnknownNameError, UnsupportedError, install_command
 
-#: Each optional part: the extra's name, its purpose, and the modules that it needs.
+#: Optional parts: the name of the extra, its purpose, and the modules that it needs.
 EXTRAS: Final = (
     ("sim", "simulator's cameras", ("cv2",)),
     ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
@@ -53,7 +53,7 @@ def install(
 ) -> None:
     """Install optional parts of Skyloop into the Python environment that runs this command.
 
-    skyloop doctor shows the parts, and which of them are missing.
+    skyloop doctor shows all parts, and which of them are missing.
     """
     wanted = requirements(parts)
     if dry_run:
@@ -65,11 +65,11 @@ def install(
 
 
 def requirements(parts: Iterable[str]) -> list[str]:
-    """Return the requirements of optional parts, in pip's syntax.
+    """Return the requirements of optional parts in pip's syntax.
 
     Raises:
-        UnknownNameError: There is no such part.
-        SkyloopError: Skyloop's own metadata is missing: it runs from a folder without installation.
+        UnknownNameError: There is no part with this name.
+        SkyloopError: Skyloop's own metadata is missing, because it runs from a folder without having been installed.
     """
     table: dict[str, list[str]] = {}
     for line in _metadata():
@@ -95,7 +95,7 @@ def _metadata() -> list[str]:
 
 
 def _installer(anew: bool) -> list[str]:
-    """Return the command that installs packages into this environment: its pip, or uv if there is none."""
+    """Return the command that installs packages into this environment: its pip or, if there is none, uv."""
     if importlib.util.find_spec("pip"):
         return [sys.executable, "-m", "pip", "install", *(["--force-reinstall"] if anew else [])]
     if shutil.which("uv"):
@@ -114,11 +114,11 @@ def missing(parts: Iterable[str]) -> Iterator[str]:
 def _is_there(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # its parent package is missing
+    except ModuleNotFoundError:  # the module's parent package is missing
         return False
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Extend an error that names one part to install, so that it names all of ``parts`` that are missing."""
+    """Extend an error that names one part to install, so that it names all missing ones of ``parts``."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

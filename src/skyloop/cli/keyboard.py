@@ -1,7 +1,7 @@
-"""A terminal's keys as a pilot's sticks and orders: :class:`Hands` and :class:`Tokenizer` are pure.
+"""Convert a terminal's keys to a pilot's sticks and orders; :class:`Hands` and :class:`Tokenizer` are pure.
 
-A terminal sends presses and repeats, but never releases. A press therefore moves its stick for :data:`HOLD_S`, longer
-than terminals wait before they repeat a key, and repeats keep it there.
+A terminal reports presses and repeats, but never releases. A press therefore moves its stick for :data:`HOLD_S`, which
+is longer than terminals wait before they repeat a key; repeats keep the stick there.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.files import wait_readable
 from skyloop.messages import FlightState
 
-HOLD_S: Final = 0.6  #: duration of a press's effect on its stick
-TWICE_S: Final = 1.0  #: two presses of Esc within this cut the motors
-REPEAT_S: Final = 0.12  #: a held key repeats faster than this, but no finger does
-DELAY_S: Final = 0.2  #: no keyboard begins to repeat sooner
+HOLD_S: Final = 0.6  #: how long a press moves its stick
+TWICE_S: Final = 1.0  #: two presses of Esc within this time cut the motors
+REPEAT_S: Final = 0.12  #: a held key repeats faster than this; no finger does
+DELAY_S: Final = 0.2  #: no keyboard starts repeating sooner
 SAME_S: Final = 0.04  #: a second Esc this close to the keyboard's delay may be a repeat of the first
-LANDING_S: Final = 3.0  #: no stick moves for this long after L, as the vehicle may not show its landing yet
-STOPPING_S: Final = 2.0  #: nothing else is requested for this long after a stop, unless the vehicle shows it
-_ESC_ALONE_S: Final = 0.03  #: an arrow's remaining bytes arrive within this after its Esc
-_LONGEST: Final = 32  # maximum bytes of a sequence
+LANDING_S: Final = 3.0  #: no stick moves for this long after L, because the vehicle may not show its landing yet
+STOPPING_S: Final = 2.0  #: nothing else is requested for this long after a stop, unless the vehicle already shows it
+_ESC_ALONE_S: Final = 0.03  #: the remaining bytes of an arrow key arrive within this time after its Esc
+_LONGEST: Final = 32  # maximum length of a sequence in bytes
 
 Order = Literal[
     "takeoff",
@@ -40,7 +40,7 @@ Order = Literal[
     "slower",
     "quit",
     "centre",  #: the sticks were released
-    "held",  #: Esc is held, which does not count as a second press
+    "held",  #: Esc is being held, which does not count as a second press
     "grounded",  #: a stick was moved on the ground
 ]
 Axis = Literal["forward", "left", "up", "yaw_rate"]
@@ -66,7 +66,7 @@ ORDERS: Final[dict[str, Order]] = {
     "-": "slower",
     "q": "quit",
 }
-#: For people: the same keys as in the cockpit.
+#: The keys and their meanings, for users; the same as in the cockpit.
 KEY_MAP: Final = (
     ("Esc Esc", "motors off, at once; the first Esc hovers"),
     ("T", "take off"),
@@ -81,7 +81,7 @@ KEY_MAP: Final = (
     ("Q", "land if flying, and quit"),
 )
 _NAMES: Final = {"up": "↑", "down": "↓", "left": "←", "right": "→", " ": "Space", "\n": "Enter", "\t": "Tab"}
-#: Asks the terminal to report when its window gains and loses the keyboard, or to stop that.
+#: Asks the terminal to report when its window gains and loses the keyboard focus, or to stop reporting.
 TELL_FOCUS: Final = "\x1b[?1004h"
 TELL_NO_FOCUS: Final = "\x1b[?1004l"
 _FOCUS: Final = {
@@ -95,7 +95,7 @@ _UNFINISHED: Final = re.compile(rb"\x1b+(?:\[[0-?]*[ -/]*|O[0-9;]*)?")
 
 
 class Deflection(NamedTuple):
-    """Position of the sticks, each from -1 to 1: forward, left, up, counter-clockwise."""
+    """Positions of the sticks, each from -1 to 1: forward, left, up, counter-clockwise."""
 
     forward: int = 0
     left: int = 0
@@ -104,28 +104,28 @@ class Deflection(NamedTuple):
 
 
 class Hands:
-    """Turns a pilot's keys into orders. Pure: the time [s] is an argument."""
+    """Converts a pilot's keys to orders. Pure: the time [s] is an argument."""
 
     def __init__(self) -> None:
-        self._stepped_s = -math.inf  # the last step
+        self._stepped_s = -math.inf  # time of the last step
         self._pressed: dict[Axis, tuple[int, float]] = {}
-        self._held_over: dict[str, float] = {}  # stick keys held during a landing, and their last repeats
+        self._held_over: dict[str, float] = {}  # stick keys held during a landing, and when they last repeated
         self._moving = False  # whether the last step moved a stick
         self._landed_s = -math.inf  # time of the last L
         self._stopped_s = -math.inf  # time of the last stop
-        self._escaped_s = -math.inf  # time of the last Esc, if no other key followed
-        self._second: tuple[float, float] | None = None  # a second one: its time, and the time since the first
-        self._repeats = False  # Esc is held
-        self._doubtful = False  # the last Esc may have been a press, or the first repeat of a held key
-        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; unknown yet
-        self._newest = "", -math.inf, math.inf  # the last key, its time, and the time since the same key before
-        self.no_effect = ""  #: why a key of the last step had no effect, for people; empty if all had
+        self._escaped_s = -math.inf  # time of the last Esc, unless another key followed
+        self._second: tuple[float, float] | None = None  # a second Esc: its time, and the time since the first
+        self._repeats = False  # whether Esc is being held
+        self._doubtful = False  # whether the last Esc may have been either a press or the first repeat of a held key
+        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; not known yet
+        self._newest = "", -math.inf, math.inf  # the last key, its time, and the time since the same key came before
+        self.no_effect = ""  #: why a key in the last step had no effect, for users; empty if all had
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
-        """Return the orders, in sequence; the position of the sticks comes last, if one is moved."""
+        """Return the orders in sequence. If a stick is moved, the positions of the sticks come last."""
         wanted: list[Order | Deflection] = []
         self.no_effect = ""
-        stalled = now_s - self._stepped_s > REPEAT_S  # keys may have queued up, so their times mean nothing
+        stalled = now_s - self._stepped_s > REPEAT_S  # keys may have queued up, so their times are meaningless
         self._stepped_s = now_s
         repeats = stalled and bool(keys) and keys[0] == "esc"
         if self._second is not None and now_s - self._second[0] >= REPEAT_S and not repeats:
@@ -149,7 +149,7 @@ class Hands:
         return wanted
 
     def _learn(self, key: str, now_s: float, *, stalled: bool) -> None:
-        """Learn the keyboard's delay from a held key: one press, a pause, and then many in a row."""
+        """Learn the keyboard's delay from a held key: one press, a pause, then many presses in succession."""
         before, at_s, gap_s = self._newest
         since_s = now_s - at_s if key == before else math.inf
         if since_s < REPEAT_S and DELAY_S <= gap_s <= TWICE_S and not stalled:
@@ -159,14 +159,14 @@ class Hands:
     def _press(self, key: str, now_s: float, state: FlightState) -> Order | None:
         second, self._second, self._escaped_s = self._second, None, -math.inf
         if second is not None and second[1] < DELAY_S:
-            return self._stop(now_s)  # no held key repeats this soon: it was pressed twice
+            return self._stop(now_s)  # no held key repeats so early: it was pressed twice
         key = key.lower()
         order = "hover" if key == "alt" else ORDERS.get(key)
         if order == "quit":
             return order
         if now_s - self._stopped_s < STOPPING_S and state is not FlightState.EMERGENCY:
             self.no_effect = f"{_shown(key)} has no effect while the motors are being stopped"
-            return None  # no order replaces a stop that the vehicle does not show yet
+            return None  # no order may replace a stop that the vehicle does not show yet
         if key not in STICKS:
             if order is None:
                 self.no_effect = f"{_shown(key)} has no function here"
@@ -177,21 +177,21 @@ class Hands:
             self.no_effect = (
                 f"{_shown(key)} has no effect during a landing; release it, end the landing with H, and press it again"
             )
-            self._held_over[key] = now_s  # only H ends a landing: no stick, and no key held meanwhile
+            self._held_over[key] = now_s  # only H ends a landing: sticks don't, nor do keys held meanwhile
         else:
             self._pressed[axis] = (sign, now_s)
         return None
 
     def _escape(self, now_s: float, *, stalled: bool) -> Order | None:
-        """Hover at the first press, and cut the motors at the second; a held key makes no second press."""
+        """Hover at the first press and cut the motors at the second; a held key does not make a second press."""
         if now_s - self._stopped_s < STOPPING_S:
-            return self._stop(now_s)  # once more, and no hover instead
+            return self._stop(now_s)  # stop again, rather than hover
         gap_s, self._escaped_s = now_s - self._escaped_s, now_s
         if self._second is not None or (self._repeats and gap_s < REPEAT_S):
             first, self._second, self._repeats, self._doubtful = not self._repeats, None, True, False
             return "held" if first else None
         if self._doubtful and gap_s <= TWICE_S and not stalled:
-            return self._stop(now_s)  # no repeat comes this late: a new press, whatever the previous one was
+            return self._stop(now_s)  # no repeat comes so late: it is a new press, whatever the previous one was
         if gap_s > TWICE_S or self._repeats:
             self._repeats = self._doubtful = False
             return "hover"
@@ -212,29 +212,30 @@ class Hands:
 
 
 def _shown(key: str) -> str:
-    """Return a key as written on keyboards, or the bytes it sends."""
+    """Return a key as printed on keyboards, or the bytes that it sends."""
     return _NAMES.get(key) or (key.upper() if key.isprintable() else repr(key))
 
 
 class Tokenizer:
-    """Turns a terminal's bytes into keys: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
+    """Converts a terminal's bytes to keys: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
 
-    Alt sends an Esc before its key, as do two keys pressed almost together: ``alt`` hovers, and does not count as Esc.
+    Alt sends an Esc before its key, and so does Esc pressed almost together with another key: ``alt`` hovers, and does
+    not count as Esc.
     """
 
     def __init__(self) -> None:
         self._rest = b""
-        self._alone = False  # an Esc was taken for a single key
-        self.other = ""  #: a notice about other input in the last bytes, for people; may be empty
+        self._alone = False  # whether an Esc was taken for a key of its own
+        self.other = ""  #: a notice for users about other input in the last bytes; may be empty
 
     @property
     def waits(self) -> bool:
-        """Whether a sequence has begun."""
+        """Whether a sequence has begun but not ended."""
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[str]:
         """Return the complete keys."""
-        late = self._alone and data[:1] in (b"[", b"O")  # the rest of a slow arrow
+        late = self._alone and data[:1] in (b"[", b"O")  # the rest of an arrow key that arrived slowly
         data, self._alone = self._rest + (b"\x1b" if late else b"") + data, False
         self.other = ""
         keys: list[str] = []
@@ -246,7 +247,7 @@ class Tokenizer:
                 arrow = _ARROW.fullmatch(found[0])
                 if (focus := _FOCUS.get(found[0][-3:])) is not None:
                     self.other = focus
-                    keys += ["esc"] * (len(found[0]) - 3)  # pressed just before, and not part of this
+                    keys += ["esc"] * (len(found[0]) - 3)  # pressed just before, and not part of this sequence
                 elif arrow is not None and not late:
                     keys.append(_ARROWS[arrow[1]])
                 elif data[:2] == b"\x1b\x1b":
@@ -266,14 +267,14 @@ class Tokenizer:
         return keys
 
     def flush(self) -> list[str]:
-        """Return the keys of an unfinished sequence, after no more bytes arrived."""
+        """Return the keys of an unfinished sequence, because no more bytes arrived."""
         rest, self._rest, self.other = self._rest, b"", ""
         self._alone = rest == b"\x1b"
         return ["esc"] * len(rest) if not rest.strip(b"\x1b") else ["alt"]
 
 
 class Keyboard:
-    """The terminal's keys, one by one, without Enter; a context manager that restores the terminal.
+    """Reads the terminal's keys one by one, without Enter; a context manager that restores the terminal.
 
     Raises:
         UsageError: Standard input is not a terminal.
@@ -301,7 +302,7 @@ class Keyboard:
         self._set_mode()
         self._continued = signal.signal(
             signal.SIGCONT, lambda *_: self._set_mode()
-        )  # a shell has set its own mode meanwhile
+        )  # a shell has set its own mode in the meantime
         return self
 
     def __exit__(
@@ -311,7 +312,7 @@ class Keyboard:
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
 
     def _set_mode(self) -> None:
-        """Read single keys; Ctrl-C still interrupts, Ctrl-Z does not suspend a flight and Ctrl-S blocks nothing."""
+        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S blocks nothing."""
         termios = self._termios
         self._tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)
@@ -323,7 +324,7 @@ class Keyboard:
 
     @property
     def other(self) -> str:
-        """A notice about other input just read, for people; may be empty."""
+        """A notice for users about other input just read; may be empty."""
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""``skyloop list``: proxies of this host and the network, with their pilots; ``skyloop audit``: who flew when."""
+"""``skyloop list``: shows proxies on this host and the network, with their pilots; ``skyloop audit``: who flew when."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A proxy as a row of ``list``."""
+    """A proxy, as a row of ``list``."""
 
     name: str
     transport: str = "local"  #: ``local``, ``fabric`` (the network) or both
@@ -73,7 +73,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return in words that no proxy was found here or on the network searched, and whose proxies run here."""
+    """Return text saying that no proxy was found here or on the network searched, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
@@ -81,7 +81,7 @@ def none_runs(settings: FabricSettings | None) -> str:
 
 
 def of_others() -> str:
-    """Return in words which proxies other users run on this host; empty if there are none."""
+    """Return text saying which proxies other users run on this host; empty if there are none."""
     from skyloop.transport.local import names_of_others
 
     theirs = [f"{user} runs {', '.join(sorted(names))}" for user, names in sorted(names_of_others().items())]
@@ -91,9 +91,9 @@ def of_others() -> str:
 
 
 def running(settings: FabricSettings | None = None) -> list[Row]:
-    """Return all proxies of this host and, with settings, of the network, by name.
+    """Return all proxies on this host and, with settings, on the network, by name.
 
-    They are queried in parallel, so a suspended one delays the list only once.
+    They are queried in parallel, so suspended ones delay the list only once.
     """
     from skyloop.transport.local import list_names
 
@@ -118,7 +118,7 @@ def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
 
 
 def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
-    """Return the reports of the proxies of one process, several over one connection if possible."""
+    """Return the reports of a process's proxies, several over one connection if possible."""
     overview: dict[str, VehicleOverview] = {}
     if len(rows) > 1:
         try:
@@ -133,7 +133,7 @@ def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
 
 
 def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOverview) -> Row:
-    """Return the row with the proxy's report on the vehicle."""
+    """Return the row completed with the proxy's report on the vehicle."""
     return msgspec.structs.replace(
         row,
         vehicle=vehicle,
@@ -148,7 +148,7 @@ def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOvervie
 
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
-    """Merge these proxies with the network's; one that is reached both ways has one row."""
+    """Merge these proxies with those on the network. A proxy reached both ways gets one row."""
     from skyloop.network import list_proxies as far
 
     rows = {(row.host, row.pid, row.name): row for row in near}
@@ -167,7 +167,7 @@ def describe(name: str) -> Row:
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
-    """Return a proxy's report about itself; if it does not answer, the reason."""
+    """Return a proxy's description of itself or, if it does not answer, the reason."""
     try:
         with observed(row, settings) as drone:
             return with_state(row, drone.capabilities.vehicle, drone.uri, drone.feedback())
@@ -176,10 +176,10 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer of this name, over the transport in its row.
+    """Connect to a proxy as an observer with this name, over the transport in its row.
 
     Raises:
-        SkyloopError: It does not answer.
+        SkyloopError: The proxy does not answer.
     """
     from skyloop.client import connect
 
@@ -194,7 +194,7 @@ def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop lis
 
 
 def lines(rows: Iterable[Row]) -> list[str]:
-    """Return the rows as a text table, with the address last because it may be long."""
+    """Return the rows as a text table. The address comes last, because it may be long."""
     cells = [("NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
     cells += [
         (
@@ -249,7 +249,7 @@ def audit(
 
 
 def flight_lines(rows: Sequence[Tenure]) -> list[str]:
-    """Return the tenures as a text table."""
+    """Return the periods of authority as a text table."""
     cells = [HEAD]
     cells += [
         (
@@ -290,7 +290,7 @@ def _files(name: str | None, file: Path | None) -> list[Path]:
 
 
 def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
-    """Connect like :func:`skyloop.connect`; if another client flies, the error names it and gives advice."""
+    """Connect like :func:`skyloop.connect`. If another client is flying, the error names it and gives advice."""
     from skyloop.client import connect
 
     try:

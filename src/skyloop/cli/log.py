@@ -27,7 +27,7 @@ _EXAMPLE: Final = "Example: skyloop log "
 
 
 class Form(StrEnum):
-    """Formats that recordings can be exported to."""
+    """The formats to which recordings can be exported."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -38,7 +38,7 @@ class Form(StrEnum):
 
 
 class Which(StrEnum):
-    """Commands before or after the proxy's limits."""
+    """Whether to compare commands before or after the proxy's limits."""
 
     ASKED = "asked"
     APPLIED = "applied"
@@ -77,7 +77,7 @@ def list_recordings(
     folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Folder of recordings")] = Path(),
     json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
-    """List the recordings in a folder: drones, start and duration. A file's problem is shown in its row."""
+    """List the recordings in a folder: drones, start and duration. Problems with a file are shown in its row."""
     import msgspec
 
     from skyloop.cli import log_tables
@@ -144,9 +144,9 @@ def export(
 ) -> None:
     """Write the samples as tables, a camera's frames as a video, flights as training data, or everything for Rerun.
 
-    H.264 is copied as recorded, in seconds, unless the time is written into the frames. For lerobot, flights become
-    episodes of a LeRobotDataset: pictures, the state at their capture, and the commands. rrd is a file for Rerun's
-    viewer, with all drones. Foxglove and Lichtblick open the recording itself.
+    H.264 is copied as recorded, which takes seconds, unless the time is drawn on the frames. For lerobot, flights
+    become episodes of a LeRobotDataset: pictures, the state when each was captured, and the commands. rrd is a file for
+    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording itself.
     """
     from skyloop.cli import log_tables
     from skyloop.recording.review import tables as ways
@@ -210,7 +210,7 @@ def compare(
     part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Compare a changed controller's commands with the old one's: RMS of each set-point, and where they diverge."""
+    """Compare a changed controller's commands to the old one's: RMS of each set-point, and where they diverge."""
     from skyloop.cli import log_tables
     from skyloop.recording.review.compare import compare as commands_of
 
@@ -239,7 +239,7 @@ def recover(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Write the readable part of a cut or damaged recording to a new file with an index; the old one is kept."""
+    """Write the readable part of a cut or damaged recording to a new file with an index. The old file is kept."""
     from skyloop.cli import log_tables
     from skyloop.recording.review import summary as mending
 
@@ -313,7 +313,7 @@ def _open(file: Path) -> Recording:
 
 
 def _file(output: Path | None, name: str, beside: Path) -> Path:
-    """Return the file to write: in a folder with that name, else with its ending."""
+    """Return the file to write: inside a folder if one is given, otherwise with the right suffix."""
     if output is None:
         return beside.with_name(name)
     return output / name if output.is_dir() else output.with_suffix(output.suffix or Path(name).suffix)

@@ -1,4 +1,4 @@
-"""Recordings as tables for the terminal."""
+"""Format recordings as tables for the terminal."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _head(recording: Recording, summary: Summary) -> Table:
 
 def _channels(summary: Summary) -> Table:
     table = Table(box=None)
-    table.add_column("topic", overflow="fold")  # never cut: it identifies the rows
+    table.add_column("topic", overflow="fold")  # never cut, because it identifies the rows
     for title in ("count", "rate", "gaps", "longest", "missing", "size"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("delay [ms]: median (p99)")
@@ -108,12 +108,12 @@ def _losses(summary: Summary) -> Iterator[str]:
 
 
 def recovered_json(file: Path, saved: Recovered | None) -> str:
-    """Return the output of ``skyloop log recover --json``: ``saved`` is null for a complete recording."""
+    """Return the output of ``skyloop log recover --json``; ``saved`` is null if the recording was complete."""
     return msgspec.json.encode({"file": str(file), "saved": saved}, enc_hook=str).decode()
 
 
 def exported(found: Videos, camera: str) -> Iterator[str]:
-    """Yield a line for each exported video, and one for missing frames."""
+    """Yield a line for each exported video, and one about missing frames."""
     for video in found.videos:
         since = f", from {video.begin_s:.3f} s on" if video is not found.videos[0] else ""
         how = "as it was recorded" if video.copied else "encoded"
@@ -132,7 +132,7 @@ def comparison_json(found: Comparison) -> str:
 
 
 def comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
-    """Return the differences of two recordings, as parts to print."""
+    """Return the differences between two recordings, as parts to print."""
     parts = "they never diverge" if found.part_at_s is None else f"they diverge at {found.part_at_s:.2f} s"
     table = Table(named("set-point"), "RMS", "largest", "at", "compared", box=None)
     for field in found.fields:

@@ -1,6 +1,6 @@
-"""How command lines name drones and the network: the same words, help and completion for every command.
+"""How command lines name drones and the network, with the same words, help and completion in every command.
 
-A drone is named by NAME; ``--drone NAME`` means the same everywhere. The network is ``--network WHERE``.
+A drone is given as NAME; ``--drone NAME`` means the same everywhere. The network is given as ``--network WHERE``.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
 
 
 def drone_names(incomplete: str) -> list[str]:
-    """Return the names of proxies on this host, sorted, from their sockets, without querying them."""
-    with suppress(Exception):  # shells show no errors during completion
+    """Return the sorted names of proxies on this host, taken from their sockets, without querying them."""
+    with suppress(Exception):  # shells don't show errors during completion
         from skyloop.transport.local import list_names
 
         return sorted(proxy.name for proxy in list_names() if proxy.name.startswith(incomplete))
@@ -31,7 +31,7 @@ def drone_names(incomplete: str) -> list[str]:
 
 
 def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the parameters of the drone already named in the command line."""
+    """Return the parameters of the drone that the command line already names."""
     name = ctx.params.get("name") or ctx.params.get("drone")
     if not name:
         return []
@@ -44,22 +44,22 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def network_places(incomplete: str) -> list[str]:
-    """Return the network place that needs no address."""
+    """Return the network place that is not an address."""
     return [place for place in ("multicast",) if place.startswith(incomplete)]
 
 
 def recordings(incomplete: str) -> list[str]:
-    """Return recordings, and folders that may contain some."""
+    """Return recordings, and folders that may contain recordings."""
     return files_ending(incomplete, {".mcap"})
 
 
 def python_files(incomplete: str) -> list[str]:
-    """Return Python files, and folders that may contain some."""
+    """Return Python files, and folders that may contain them."""
     return files_ending(incomplete, {".py"})
 
 
 def files_ending(incomplete: str, endings: Iterable[str]) -> list[str]:
-    """Return folders and files with these suffixes that begin with the typed text."""
+    """Return folders, and files with these suffixes, whose names begin with the text typed."""
     folder, _, start = incomplete.rpartition("/")
     wanted, found = set(endings), []
     with suppress(OSError):
@@ -115,15 +115,15 @@ def keys_directory() -> Path:
 
 
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
-    """Return the drone that a command addresses.
+    """Return the drone that a command is for.
 
     Args:
-        name: Given as NAME.
-        drone: Given as ``--drone``.
-        default: Used if neither is given; None: one is required.
+        name: The drone given as NAME.
+        drone: The drone given as ``--drone``.
+        default: Used if neither is given; None: a name is required.
 
     Raises:
-        UsageError: No drone is named, or two are.
+        UsageError: No drone is given, or two are.
     """
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
@@ -134,10 +134,10 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 
 
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
-    """Return the drones that a command addresses, each once: first those given as NAME, then as ``--drone``.
+    """Return the drones that a command is for, each once: those given as NAME first, then those given as ``--drone``.
 
     Raises:
-        UsageError: No drone is named although one is required.
+        UsageError: No drone is given, but one is required.
     """
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
@@ -160,14 +160,14 @@ def join_network(network: str | None, keys: Path | None) -> None:
         return
     from skyloop.network.config import choose
 
-    choose(network, keys)  # raises for invalid values
+    choose(network, keys)  # raises if values are invalid
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
         if value is not None:
             os.environ[variable] = str(value)
 
 
 def with_place(arguments: Sequence[str]) -> list[str]:
-    """Insert ``multicast`` after a ``--network`` without a place, and return the words."""
+    """Insert ``multicast`` after a ``--network`` that has no place; return the words."""
     words: list[str] = []
     for index, word in enumerate(arguments):
         words.append(word)

@@ -1,6 +1,6 @@
-"""The network: options shared by commands that serve vehicles, ``skyloop router`` and ``skyloop keys``.
+"""The network: options shared by commands that serve vehicles; the commands ``skyloop router`` and ``skyloop keys``.
 
-``skyloop keys`` decides who may join a lab's network, with which rights.
+``skyloop keys`` determines who may join a lab's network, and with which rights.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ ListenOption = Annotated[
     list[str] | None,
     typer.Option(metavar="ADDR", help="Network: address to listen on, e.g. 10.0.0.5:7447 [all, any free port]"),
 ]
-#: The former option for routers, before ``--network`` accepted their addresses.
+#: The former option for routers, from before ``--network`` accepted their addresses.
 ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
     bool,
@@ -65,7 +65,7 @@ OPEN: Final = (
     "people you trust can reach, or give each of them a key: skyloop keys --help"
 )
 
-#: Creates a proxy's transport server from its name and its vehicle's address.
+#: Creates a proxy's transport server, given the proxy's name and the vehicle's address.
 MakeEnd = Callable[[str, str], "TransportServer"]
 
 
@@ -76,7 +76,7 @@ def settings_of(
     multicast: bool,
     keys: Path | None,
 ) -> FabricSettings | None:
-    """Return the settings from the options; None to stay on this host.
+    """Return the settings given by the options, or None to stay on this host.
 
     Raises:
         UsageError: An option needs ``--network``, or is invalid.
@@ -93,10 +93,10 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return the settings of a network, given as in ``--network``.
+    """Return the settings of a network given as in ``--network``.
 
     Raises:
-        UsageError: An address or the folder is invalid, or no place is named.
+        UsageError: An address or the folder is invalid, or no place is given.
     """
     from skyloop.network.config import serving
 
@@ -104,7 +104,7 @@ def places(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return a factory for a proxy's transport server: for this host, optionally a group, and the network if set."""
+    """Return a factory for a proxy's transport server, for this host, optionally a group, and the network if set."""
     from skyloop.transport.local import LocalServer
 
     if settings is None:
@@ -120,7 +120,7 @@ def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | No
 
 
 def metrics_beside(where: str | None) -> Beside | None:
-    """Return the metrics server to run beside a process's proxies; None without ``--metrics``.
+    """Return the metrics server to run along with a process's proxies; None without ``--metrics``.
 
     Raises:
         UsageError: ``where`` is not an address.
@@ -131,11 +131,11 @@ def metrics_beside(where: str | None) -> Beside | None:
     from skyloop.metrics.endpoint import parse_where
 
     parse_where(where)
-    return serving_beside(where, tell)  # on standard error, because programs read the proxies' lines on standard output
+    return serving_beside(where, tell)  # on standard error: programs read the proxies' lines on standard output
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
-    """Warn every time, in plain words, about a network without keys."""
+    """Warn each time, in plain words, about a network without keys."""
     if settings is not None and settings.tls is None:
         typer.echo(
             OPEN.format(names=" and ".join(names) if len(names) < 4 else f"these {len(names)} vehicles"), err=True
@@ -143,13 +143,13 @@ def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
 
 
 def settle(options: SimOptions) -> None:
-    """Make room in this process for the threads that relay commands, beside those that step and draw.
+    """Make room in this process for the threads that relay commands, next to those that step and draw.
 
-    The interpreter lock is released after one millisecond instead of five, and OpenCV uses one core. Do not call this
-    in the user's process.
+    The GIL is released after one millisecond instead of five, and OpenCV uses one core. Do not call this in the user's
+    process.
 
     Raises:
-        MissingExtraError: Cameras are requested, but the renderer's extra is not installed.
+        MissingExtraError: Cameras were requested, but the renderer's extra is not installed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:
@@ -187,7 +187,7 @@ def router(
 ) -> None:
     """Relay between proxies and applications of several networks, until Ctrl-C.
 
-    Each of them connects to a router within reach; routers connect to each other.
+    Each proxy and application connects to a router within reach; routers connect to one another.
     """
     from skyloop.network import config
     from skyloop.network.config import Part
@@ -274,7 +274,7 @@ def issue(
     days: Annotated[float, typer.Option(metavar="N", help="Validity")] = 30.0,
     directory: LabOption = None,
 ) -> None:
-    """Create a key and a certificate, in a folder for their holder. An old key of that name stays valid."""
+    """Create a key and a certificate in a folder for their holder. An old key with that name stays valid."""
     from skyloop.network.keys import Lab
     from skyloop.network.keys.identity import make_identity
 
@@ -290,9 +290,9 @@ def show(
     directory: LabOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """List all identities: role, drones, expiry. --dir may also be the folder of an identity, to show its copy.
+    """List all identities: role, drones, expiry. --dir may also be an identity's folder, to show its copy.
 
-    Keys that have expired, or will within a week, are also listed on standard error.
+    Keys that have expired or will expire within a week are also listed on standard error.
     """
     from skyloop.network.keys.credentials import expiry_warning, read_public
 
@@ -318,7 +318,7 @@ def revoke(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Identity whose key was lost, or who left")],
     directory: LabOption = None,
 ) -> None:
-    """Remove an identity from the roster. Its key is rejected wherever the new roster is in use."""
+    """Remove an identity from the roster. Its key is rejected wherever the new roster is used."""
     from skyloop.network.keys import Lab
 
     lab = Lab.open(_place(directory))

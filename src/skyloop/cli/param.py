@@ -24,7 +24,7 @@ ADVICE: Final = "write after they have landed, or take over with a higher --prio
 TRUTH: Final = {
     word: truth for truth, words in ((True, "true yes on 1"), (False, "false no off 0")) for word in words.split()
 }
-LONGEST_VALUE: Final = 30  #: of a value in a table; a simulator's world has a thousand characters
+LONGEST_VALUE: Final = 30  #: maximum length of a value in a table; a simulator's world has a thousand characters
 KINDS: Final = {
     ParameterType.BOOL: "true or false",
     ParameterType.INT: "a whole number",
@@ -53,8 +53,8 @@ def param(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """List the parameters of a vehicle, show one, or write one."""
-    if drone is not None:  # the words before are then KEY and VALUE
+    """List a vehicle's parameters, show one, or write one."""
+    if drone is not None:  # in this case, the words that remain are KEY and VALUE
         if value is not None and name != drone:
             raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
         if name != drone:
@@ -92,10 +92,10 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """Parse a value typed by a person, by the parameter's type.
+    """Parse a value typed by a person according to the parameter's type.
 
     Raises:
-        UsageError: It has another type.
+        UsageError: The value has another type.
     """
     try:
         match parameter.type:
@@ -114,13 +114,13 @@ def parse_value(parameter: Parameter, text: str) -> Value:
 
 
 def table(parameters: list[Parameter]) -> list[str]:
-    """Return a line for each parameter: name, value with unit, allowed values; long values are cut."""
+    """Return a line for each parameter: name, value with unit, allowed values. Long values are cut."""
     rows = [(p.name, shorten(f"{show(p.value)} {p.unit}".rstrip()), allowed(p)) for p in parameters]
     return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
 
 
 def shorten(value: str) -> str:
-    """Return a value shortened to fit into a table."""
+    """Return a value, shortened to fit into a table."""
     return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
@@ -138,7 +138,7 @@ def details(parameter: Parameter) -> list[str]:
 
 
 def allowed(parameter: Parameter) -> str:
-    """Return a parameter's allowed values, for people."""
+    """Return a parameter's allowed values as text for users."""
     p = parameter
     if p.read_only:
         return "read-only"
@@ -153,7 +153,7 @@ def allowed(parameter: Parameter) -> str:
 
 
 def show(value: Value) -> str:
-    """Return a value as a person would type it."""
+    """Return a value the way a person would type it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

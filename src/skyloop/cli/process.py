@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
 _MOST_WORKERS: Final = 64
-MOST: Final = 64  #: detections published of one frame, the most certain: a result is limited to 32 768 bytes
+MOST: Final = 64  #: most detections published per frame, the most certain: a result is limited to 32 768 bytes
 
 
 def process(
@@ -90,7 +90,7 @@ def process(
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
-        pass  # the normal end
+        pass  # the normal way to end
 
 
 def work(
@@ -102,7 +102,7 @@ def work(
     *,
     child: bool,
 ) -> None:
-    """Run one worker, of the processor returned by ``make``, in this process until its end."""
+    """Run one worker in this process until it ends, with the processor returned by ``make``."""
     from skyloop.client import connect
     from skyloop.processing import Worker
     from skyloop.processing.group import end_with_parent
@@ -137,7 +137,7 @@ def _lead(
     seconds: float | None,
     show: Callable[[Status], str],
 ) -> None:
-    """Run several workers, each in its own process, so that none waits for another's interpreter."""
+    """Run several workers, each in its own process, so that none waits for another's GIL."""
     from skyloop.processing.group import Group, child_command
 
     if "://" in drone:
@@ -155,7 +155,7 @@ def _lead(
 
 
 def _arguments(settings: Settings, target: str, drone: str, seconds: float | None) -> list[str]:
-    """Return the command of one of several workers."""
+    """Return the command that starts one of several workers."""
     options: dict[str, object] = {
         "--drone": drone,
         "--name": settings.name,
@@ -170,7 +170,7 @@ def _arguments(settings: Settings, target: str, drone: str, seconds: float | Non
 
 
 def show_text(status: Status) -> str:
-    """Return a line for people."""
+    """Return a line for users."""
     return f"{time.strftime('%H:%M:%S')}  {status}"
 
 
@@ -237,18 +237,18 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # the normal end
+    with contextlib.suppress(KeyboardInterrupt):  # the normal way to end
         work(make, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
 class DetectionProcessor:
-    """Publishes a detector's findings: ``{"detections": [{"box": …, "score": …, "class_id": …, "class_name": …}, …]}``.
+    """Publishes a detector's results: ``{"detections": [{"box": …, "score": …, "class_id": …, "class_name": …}, …]}``.
 
-    Each is drawn as a closed outline of four corners, and a text with its class and score.
+    Each detection is drawn as a closed outline with four corners, and a text with its class and score.
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
-        """Set the detector, called on the worker's thread, and the names of the classes to publish; none: all."""
+        """Set the detector, called on the worker's thread, and the names of the classes to publish; empty: all."""
         self._detector = detector
         self._classes = frozenset(classes)
 

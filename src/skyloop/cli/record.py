@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from skyloop.recording.options import VideoEncoding
     from skyloop.recording.view import Screen, View
 
-REFRESH_S: Final = 0.25  # on a terminal
-LINE_EVERY_S: Final = 1.0  # in a pipe
+REFRESH_S: Final = 0.25  # used on a terminal
+LINE_EVERY_S: Final = 1.0  # used in a pipe
 _LOOK_S: Final = 0.5
 
 
@@ -58,7 +58,7 @@ def record(
 ) -> None:
     """Record drones to an MCAP file until Ctrl-C. Only observes: any application may fly meanwhile.
 
-    If the output is not a terminal: one line per second.
+    If the output is not a terminal, a line is printed each second.
     """
     from skyloop.recording import record as start
 
@@ -67,7 +67,7 @@ def record(
         drones(names, drone),
         output,
         channels=None if channels is None else [name.strip() for name in channels.split(",")],
-        encoding=cast("VideoEncoding", encoding),  # checked by the recorder
+        encoding=cast("VideoEncoding", encoding),  # validated by the recorder
         quality=quality,
         rotate_mb=rotate_mb,
         rotate_s=rotate_s,
@@ -77,7 +77,7 @@ def record(
         in_process=True,
     )
     interrupt_by_signals((signal.SIGTERM,))
-    with recorder, suppress(KeyboardInterrupt):  # the normal end
+    with recorder, suppress(KeyboardInterrupt):  # the normal way to end
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
 
@@ -95,14 +95,14 @@ def _show(recorder: Recorder, seconds: float) -> None:
         line = progress(status, before)
         typer.echo(f"\r\x1b[K{line}" if live else line, nl=not live)
         before = status
-        if status.state.value == "failed":  # it does not recover
+        if status.state.value == "failed":  # it will not recover
             break
     if live:
         typer.echo()
 
 
 def progress(status: Status, before: Status) -> str:
-    """Return the progress in one line; rates are since ``before``."""
+    """Return the progress in one line; rates are measured since ``before``."""
     span_s = max(1e-3, status.seconds - before.seconds)
     minutes, seconds = divmod(round(status.seconds), 60)
     parts = [
@@ -164,13 +164,13 @@ def view(
 ) -> None:
     """Show drones live in Foxglove or Rerun until Ctrl-C. Only observes: any application may fly meanwhile.
 
-    Connect Foxglove to the address shown. A slow or stalled viewer slows nothing else.
+    Connect Foxglove to the address shown. A slow or stalled viewer does not slow down anything else.
     """
     _refuse(foxglove, rerun, write, connect, save, port)
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal end
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to end
         from skyloop.client import connect as connect_to
         from skyloop.recording.view import View, give_way
 
@@ -217,7 +217,7 @@ def _refuse(foxglove: bool, rerun: bool, write: bool, connect: str | None, save:
 
 
 def _watch(view: View, seconds: float) -> None:
-    """Print the subscriptions each time they change."""
+    """Print the subscriptions whenever they change."""
     end = time.monotonic() + seconds
     before: dict[str, list[str]] = {}
     while (left := end - time.monotonic()) > 0:

@@ -1,4 +1,4 @@
-"""``skyloop ros``: shows drones as nodes of ROS 2."""
+"""``skyloop ros``: presents drones as nodes of ROS 2."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def ros(
 ) -> None:
     """Show drones to ROS 2: images, state and transforms as topics; fly by cmd_vel and services. Until Ctrl-C.
 
-    Each drone is a namespace, such as /alpha. Only this machine finds it, unless --subnet or the variables of ROS 2
-    say otherwise. Drones that it flies land when it ends.
+    Each drone is a namespace, such as /alpha. Only this machine finds it, unless --subnet or the ROS 2 variables say
+    otherwise. Drones flown by this command land when it ends.
     """
     from skyloop.ros import Bridge, Settings
     from skyloop.vehicles.ros2.node import domain_of
@@ -69,4 +69,4 @@ def ros(
                 typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
             bridge.run()
     except KeyboardInterrupt:
-        pass  # the normal end
+        pass  # the normal way to end

@@ -33,7 +33,7 @@ def check(
     drone: DroneOption = "sim://",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON")] = False,
 ) -> None:
-    """Show the problems of a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
+    """Show the problems with a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
     from skyloop.client import connect
     from skyloop.control import load_route
     from skyloop.control.route import check_for
@@ -94,7 +94,7 @@ def fly(
 
 
 def _run(flight: FlyRoute) -> None:
-    """Fly, with the terminal's keys if there is a terminal."""
+    """Fly the route, using the terminal's keys if there is a terminal."""
     with ExitStack() as stack:
         pressed = None
         if sys.stdin.isatty():
@@ -109,7 +109,7 @@ def _run(flight: FlyRoute) -> None:
             for key in pressed(0.0) if pressed is not None else ():
                 if key.lower() in acts:
                     acts[key.lower()]()
-            return pressed is None and flight.law.state == "paused"  # no keyboard could resume it
+            return pressed is None and flight.law.state == "paused"  # no keyboard could resume the route
 
         flight.run(until=look)
     if flight.law.state == "paused":

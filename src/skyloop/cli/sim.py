@@ -1,6 +1,6 @@
 """``skyloop sim``: several simulated drones in one world.
 
-Each has its own proxy, or with ``--firmware`` is a real drone's firmware for other people's programs.
+Each has its own proxy or, with ``--firmware``, is an emulation of a real drone's firmware for other people's programs.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def sim(
     """Simulate drones that see one another in one world, each with its own proxy, until Ctrl-C.
 
     With --autopilot, real ArduCopter, PX4 or Betaflight flies them (docs/autopilots.md). With --firmware, each is
-    instead an emulated drone's firmware on the network, for any program that flies the real one.
+    instead an emulation of a drone's firmware on the network, for any program that can fly the real one.
 
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
@@ -176,7 +176,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 
 
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
-    """Return the options of the drones' shared world.
+    """Return the options of the world that the drones share.
 
     Raises:
         UsageError: An option is invalid, or the drones can't share a world.
@@ -190,7 +190,7 @@ def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
         raise UsageError(
             "these --autopilot fly different vehicles by default: choose one, such as --option vehicle=iris"
         )
-    return min(each, key=lambda options: options.most_lag_s)  # the strictest one about the computer's time decides
+    return min(each, key=lambda options: options.most_lag_s)  # the strictest about the computer's time decides
 
 
 def _serve_proxies(
@@ -218,7 +218,7 @@ def address(world: str, seed: int, speed: float, others: list[str]) -> str:
     """Return the vehicles' address.
 
     Raises:
-        UsageError: There is no such option, or its value is invalid.
+        UsageError: An option does not exist, or its value is invalid.
     """
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
@@ -249,23 +249,23 @@ MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """The addresses of the emulated drones, and the faults of their datagrams."""
+    """The addresses of the emulated drones, and the faults applied to their datagrams."""
 
     bind: str
     port_base: int | None  #: None: the usual ports
     faults: Faults
     delay_s: float
-    video_port: int | None = None  #: for autopilots: destination port of pictures; None: none
+    video_port: int | None = None  #: for autopilots: port to which images are sent; None: none
 
 
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
-    """Run the drones until SIGINT or SIGTERM. On the main thread.
+    """Run the drones until SIGINT or SIGTERM. Must run on the main thread.
 
-    Prints a line that begins with ``ready`` for each drone once all of them listen.
+    Once all drones listen, print a line that begins with ``ready`` for each.
 
     Raises:
         UsageError: An option is invalid.
-        LinkError: A port is taken.
+        LinkError: A port is already in use.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
@@ -344,7 +344,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
     from skyloop.vehicles.tello.emulator import FRONT, TelloFirmware, with_tellos
     from skyloop.vehicles.tello.wire import PORT
 
-    prepare(FRONT, Quality(options.quality))  # compile now, so that the first picture is not delayed
+    prepare(FRONT, Quality(options.quality))  # compile now, so that the first image is not delayed
     host = SimHost(with_tellos(options), drones)
     return [
         TelloFirmware(
@@ -360,10 +360,10 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello: all have the same port, and each the address after the previous one's.
+    """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
 
     Raises:
-        UsageError: The first address is not IPv4, or there is no next one.
+        UsageError: The first address is not IPv4, or there is no next address.
     """
     if drone == 0:
         return base
@@ -374,7 +374,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone: the first one's count from ``base`` (0: any free ones), the next 10 higher.
+    """Return the ports of an AR.Drone: the first one's start at ``base`` (0: any free ones), each next one's 10 higher.
 
     Raises:
         UsageError: A port is out of range.
@@ -401,12 +401,12 @@ def _run(firmwares: Sequence[Emulated]) -> None:
             print(f"ready {describe(firmware)}", flush=True)
         while not shutdown.requested.wait(
             LOOK_UP_S
-        ):  # poll: a signal delivered to another thread does not wake this one
+        ):  # poll, because a signal delivered to another thread does not wake this one
             pass
 
 
 def describe(firmware: Emulated) -> str:
-    """Return one line with the ports of a drone."""
+    """Return a line that lists a drone's ports."""
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware
     from skyloop.vehicles.tello.emulator import TelloFirmware
 

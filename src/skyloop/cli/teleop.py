@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
 
 ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
-PERIOD_S: Final = 0.05  #: resend period of a moved stick; each press sends at once
+PERIOD_S: Final = 0.05  #: interval at which a moved stick is resent; each press is sent immediately
 REFRESH_HZ: Final = 8
 EVENTS_SHOWN: Final = 3
-GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the steps of + and -
+GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the steps selected by + and -
 
 
 def teleop(
@@ -43,9 +43,9 @@ def teleop(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Fly with keys, and watch the drone's state live. It hovers when no key is held, and lands at the end.
+    """Fly with keys and watch the drone's state live. It hovers when no key is held, and lands at the end.
 
-    The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q quit.
+    The keys are the same as in the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q quit.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -59,14 +59,14 @@ def teleop(
         try:
             Teleop(flown, speed, turn, "" if page is None else page.address()).run(keyboard)
         except (KeyboardInterrupt, EOFError):
-            pass  # like Q: leaving the block lands it
+            pass  # the same as Q: leaving the block lands the drone
         finally:
             if page is not None:
                 page.close()
 
 
 class Teleop:
-    """A pilot's session at the keys."""
+    """One session of a pilot who flies with keys."""
 
     def __init__(self, drone: Drone, speed: float, turn: float, page: str = "") -> None:
         self._drone = drone
@@ -83,7 +83,7 @@ class Teleop:
         Raises:
             EOFError: The terminal is gone.
         """
-        # Drawn on a separate thread: a stalled terminal must not delay keys.
+        # Draw on a separate thread: a stalled terminal must not delay keys.
         console = Console()
         with (
             keyboard,
@@ -99,9 +99,9 @@ class Teleop:
                 self._message = self._hands.no_effect or keyboard.other or self._message
 
     def obey(self, order: Order | Deflection) -> None:
-        """Carry out an order; an impossible one is reported and changes nothing.
+        """Carry out an order. If it is impossible, report that and change nothing.
 
-        Only taking control waits for an answer, on a separate thread: an emergency stop still works meanwhile.
+        Only taking control waits for an answer, on a separate thread: meanwhile, an emergency stop still works.
         """
         if order != "take":
             self._carry_out(order)
@@ -141,7 +141,7 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # a take-off may not show yet
+            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # the take-off may not show yet
                 return self._obey("grounded")
             drone.hover()
         elif order == "take":
@@ -171,7 +171,7 @@ class Teleop:
         return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
-        """Return the whole display, most important first: anything that does not fit is cut at the bottom."""
+        """Return the whole display, most important first: whatever does not fit is cut off at the bottom."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone
@@ -183,7 +183,7 @@ class Teleop:
 
 @contextmanager
 def _focus_told(console: Console) -> Iterator[None]:
-    """Ask the terminal to report whether its window receives keys."""
+    """Ask the terminal to report whether its window has the keyboard focus."""
     try:
         console.file.write(TELL_FOCUS if console.is_terminal else "")
         yield

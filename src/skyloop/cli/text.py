@@ -1,4 +1,4 @@
-"""Text for terminals and pipes, and errors in the terms of the command line: the problem, and the words to type."""
+"""Text for terminals and pipes, and errors in terms of the command line: the problem, and the words to type."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 _PIPE_COLUMNS: Final = 10_000
 _PLAIN_ERRORS: Final = "skyloop.plain"
-#: Replacements for characters missing from a terminal's encoding; others lose their accents, or become a "?".
+#: Replacements for characters that a terminal's encoding lacks; others lose their accents or become "?".
 _PLAIN: Final = {
     **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
     **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
 }
 _RED: Final = 31
 _YELLOW: Final = 33
-#: Beginnings of lines that are coloured.
+#: Beginnings of lines, and their colours.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 
 def make_printable() -> None:
-    """Let standard output and standard error accept every text, even if their encoding lacks some characters."""
+    """Let standard output and standard error accept any text, even if their encoding lacks some characters."""
     codecs.register_error(_PLAIN_ERRORS, _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
@@ -53,18 +53,18 @@ def _unaccented(character: str) -> str:
 
 
 def tell(text: str) -> None:
-    """Print a line for people on standard error."""
+    """Print a line for users on standard error."""
     typer.echo(text, err=True)
 
 
 def coloured(line: str, stream: TextIO | None) -> str:
-    """Return a line with its beginning coloured, if that is significant and the stream shows colours.
+    """Return a line with its beginning coloured, if that has a meaning and the stream shows colours.
 
-    A stream shows colours if it is a terminal that is not dumb, and ``NO_COLOR`` is not set (https://no-color.org).
+    A stream shows colours if it is a terminal, not a dumb one, and ``NO_COLOR`` is not set (https://no-color.org).
 
     Args:
-        line: The line, for people.
-        stream: Its destination; None, Python's value for a stream closed before the start: nowhere.
+        line: The line, for users.
+        stream: Where the line is printed. None, Python's value for a stream closed before the start: nowhere.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line
@@ -75,14 +75,14 @@ def coloured(line: str, stream: TextIO | None) -> str:
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Return rows with equal numbers of cells as lines with aligned columns."""
+    """Align rows that have equal numbers of cells, and return them as lines."""
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
 
 
 def named(title: str) -> Column:
-    """Return a table column whose words are never cut: in a narrow terminal they wrap."""
+    """Return a table column whose words are never cut; in a narrow terminal they wrap."""
     from rich.table import Column
 
     return Column(title, overflow="fold")
@@ -91,7 +91,7 @@ def named(title: str) -> Column:
 def console() -> Console:
     """Return a console for tables on standard output.
 
-    It is as wide as the terminal; in a pipe it is as wide as the tables, so that nothing is cut. ``COLUMNS`` overrides
+    It is as wide as the terminal or, in a pipe, as wide as the tables, so that nothing is cut. ``COLUMNS`` overrides
     both.
     """
     from rich.console import Console
@@ -102,10 +102,10 @@ def console() -> Console:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[..., None]]:
-    """Show a bar on standard error, if that is a terminal, and remove it at the end.
+    """Show a progress bar on standard error, if that is a terminal, and remove it at the end.
 
     Yields:
-        A function that updates the bar: with the share done, from 0 to 1, and optionally a new description.
+        A function that updates the bar, given the fraction done (0 to 1) and optionally a new description.
     """
     if not sys.stderr.isatty():
         yield lambda *_: None
@@ -121,7 +121,7 @@ def progress_bar(what: str) -> Iterator[Callable[..., None]]:
 # Errors ---------------------------------------------------------------------------------------------------------
 
 
-#: The base of Typer's errors for wrong words; its module differs between Typer's versions, its name does not.
+#: The base class of Typer's errors for invalid words. Its module varies between versions of Typer, its name does not.
 WordError: Final[type[Exception]] = next(one for one in typer.BadParameter.__mro__ if one.__name__ == "ClickException")
 
 _HINTS: Final = {
@@ -159,7 +159,7 @@ def error_text(error: SkyloopError) -> str:
 
 
 def usage_text(error: Any, name: str) -> str:
-    """Return the message for a wrong word or value raised by Typer, with its command's usage and an example."""
+    """Return the message for an invalid word or value raised by Typer, with the command's usage and an example."""
     context = getattr(error, "ctx", None)
     if type(error).__name__ == "NoArgsIsHelpError":
         return str(error.message)
@@ -185,7 +185,7 @@ def _said(error: Any) -> str:
 
 
 def plain(text: str) -> str:
-    """Rephrase a library's message about a wrong value in plain words."""
+    """Rephrase a library's message about an invalid value in plain words."""
     for pattern, words in _PLAIN_WORDS:
         text, count = pattern.subn(words, text)
         if count and words:

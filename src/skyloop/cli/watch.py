@@ -1,4 +1,4 @@
-"""``skyloop watch``: a drone's state, live in the terminal, or line by line into a pipe."""
+"""``skyloop watch``: shows a drone's state, live in the terminal or line by line in a pipe."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 REFRESH_HZ: Final = 8
-WIDE_COLUMNS: Final = 60  #: from here on, two facts side by side
-ROOMY_COLUMNS: Final = 90  #: from here on, space between them
+WIDE_COLUMNS: Final = 60  #: from this width on, two facts are shown side by side
+ROOMY_COLUMNS: Final = 90  #: from this width on, there is space between them
 LINE_EVERY_S: Final = 1.0
 EVENTS_SHOWN: Final = 8
 COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
@@ -48,7 +48,7 @@ def watch(
 ) -> None:
     """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
 
-    If the output is not a terminal: one line per second, and one for each event.
+    If the output is not a terminal, a line is printed each second, and one for each event.
     """
     from skyloop.client import connect
 
@@ -65,16 +65,16 @@ def watch(
             else:
                 _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
-            pass  # the normal end
+            pass  # the normal way to end
 
 
 def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
-    """Print a line every second, by absolute deadlines; the first one at once."""
+    """Print a line every second, with absolute deadlines; the first one immediately."""
     due = time.monotonic()
     end = due + duration_s
 
     def show(one: Event) -> None:
-        with suppress(BrokenPipeError):  # the reader is gone, as the next line also finds
+        with suppress(BrokenPipeError):  # the reader is gone, as the next line will also notice
             typer.echo(event(one))
 
     with drone.on_event(show):
@@ -96,7 +96,7 @@ def _live(drone: Drone, duration_s: float) -> None:
 
 
 def state_line(drone: Drone) -> str:
-    """Return the present state as a short line."""
+    """Return the current state as a short line."""
     feedback, link = drone.feedback(), drone.link
     rates = [f"{name} {channel.rate_hz:.0f}/s" for name, channel in drone.stats.items() if channel.count > 1]
     parts = [
@@ -142,7 +142,7 @@ def state_panel(drone: Drone) -> Panel:
 
 
 def events(drone: Drone, count: int) -> list[Text]:
-    """Return the newest events, a line each."""
+    """Return the newest events, one line each."""
     newest_ns = drone.feedback().captured_ns
     return [
         Text.assemble((f"{(event.at_ns - newest_ns) / 1e9:+7.1f} s", COLOURS[event.severity]), f" {event.text}")
@@ -175,7 +175,7 @@ def _state(drone: Drone) -> Table:
 
 
 def channels(drone: Drone) -> Table:
-    """Return rates, delays and ages, a line for each channel; in a narrow terminal only the most important ones."""
+    """Return rates, delays and ages, one line per channel; in a narrow terminal, only the most important ones."""
     titles = ("rate", "delay median", "age", "p99", "lost", "dropped")
     table = Table(named("channel"), *((*titles[:1], "delay", "age") if _is_narrow() else titles), box=None)
     for name, channel in drone.stats.items():
@@ -193,7 +193,7 @@ def channels(drone: Drone) -> Table:
 
 
 def _is_narrow() -> bool:
-    """Return whether the terminal is too narrow for two facts side by side."""
+    """Return whether the terminal is too narrow to show two facts side by side."""
     return _width() < WIDE_COLUMNS
 
 

@@ -547,7 +547,7 @@ def impossible(capabilities: Capabilities) -> dict[type, str]:
     for kind in _LATER_ACTIONS:  # older proxies can't even decode them
         if ACTION_NAMES[kind] not in capabilities.actions | capabilities.software:
             found[kind] = (
-                f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a position; an older  "
+                f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a position; an older "
                 "proxy must be updated"
             )
     return found

@@ -1,4 +1,4 @@
-"""``python -m skyloop.cockpit [NAME …]``: the cockpit as its own process.
+"""``python -m skyloop.cockpit [NAME …]``: the cockpit in its own process.
 
 The first line it prints is the page's address.
 """
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the cockpit.
 
     Args:
-        arguments: Used instead of the command line's.
+        arguments: Used in place of the command line's arguments.
 
     Returns:
         The exit code: 0, or 2 with a line of explanation if it could not start.

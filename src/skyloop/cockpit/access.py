@@ -1,4 +1,4 @@
-"""Who sent a request, and what that person may do: roles, tokens, sessions, certificates.
+"""Determine who sent a request and what that person may do: roles, tokens, sessions, certificates.
 
 ===================  ==============================================================================================
 gate                 admits
@@ -36,44 +36,44 @@ from skyloop.messages import Role
 SESSION_S: Final = 12 * 3600.0  #: lifetime of a session
 PAIRING_S: Final = 3600.0  #: lifetime of a pairing code
 MAX_SESSIONS: Final = 1000
-SHORTEST_TOKEN: Final = 16  #: characters; a shorter one could be guessed
+SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
 MAX_TOKEN: Final = 256
-CERTIFICATE: Final = "peer_certificate"  #: its key in the connection's state
+CERTIFICATE: Final = "peer_certificate"  #: key of the client's certificate in the connection's state
 
-FIRST_S: Final = 0.25  #: delay after an address's first wrong token; each further one doubles it
-LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
-FORGET_S: Final = 600.0  #: an address starts over after this long without a wrong token
-MAX_ADDRESSES: Final = 1024  #: remembered at once; the one quiet for longest is forgotten first
-FREE_IN_ALL: Final = 20  #: wrong tokens a minute, over all addresses, before the delay below is added
-EACH_IN_ALL_S: Final = 0.1  #: added by each further one a minute, from any address
+FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubles with each further one
+LONGEST_S: Final = 16.0  #: must be less than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
+FORGET_S: Final = 600.0  #: an address starts over if it sends no wrong token for this long
+MAX_ADDRESSES: Final = 1024  #: addresses remembered at once; the one that has been quiet for longest is forgotten first
+FREE_IN_ALL: Final = 20  #: wrong tokens per minute, from all addresses together, before the delay below is added
+EACH_IN_ALL_S: Final = 0.1  #: delay added by each further one per minute, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _WORD: Final = "<I" if sys.byteorder == "little" else ">I"
-_LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of the tables
+_LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of these tables
 
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
 
-MOST_NAME: Final = 40  #: characters of a name that a person wishes to have
+MOST_NAME: Final = 40  #: maximum length of a name that a person asks for
 _log = logging.getLogger(__name__)
 
 
 def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
-    """Return the user id of the program at the client's end of a loopback connection.
+    """Return the user id of the program at the client end of a loopback connection.
 
-    Looks the connection up in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
-    proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``: columns of local and remote address in hexadecimal, state, …,
-    user id and inode. A socket already closed by its program has user 0 and inode 0 there, so an entry without an
-    inode does not reveal who opened it.
+    Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
+    proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
+    state, …, user id and inode. A socket already closed by its program is listed with user 0 and inode 0, so an entry
+    without an inode does not reveal who opened it.
 
     Args:
         client: The client's address and port.
         server: This server's address and port.
 
     Returns:
-        The user id; None if it is unknown.
+        The user id, or None if it is unknown.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -94,11 +94,11 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 
 
 def _table_entry(end: Endpoint, mapped: bool) -> str:
-    """Format an address as the table does: 32-bit words in the host's order.
+    """Format an address as in the table: 32-bit words in the host's byte order.
 
     Args:
         end: Address and port.
-        mapped: Whether to write an IPv4 address as one within IPv6.
+        mapped: Whether to write an IPv4 address as an IPv4-mapped IPv6 address.
     """
     address = ipaddress.ip_address(end[0])
     packed = address.packed
@@ -110,22 +110,22 @@ def _table_entry(end: Endpoint, mapped: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Whoever sent a request, as far as known; ``name`` may be empty."""
+    """The sender of a request, as far as known; ``name`` may be empty."""
 
     role: Role
     name: str = ""
 
     def may(self, role: Role) -> bool:
-        """Return whether this person has a role's permissions: a pilot may also observe."""
+        """Return whether this person has the permissions of a role: a pilot may also observe."""
         return self.role is Role.PILOT or role is Role.OBSERVER
 
     def called(self, wish: str) -> str:
-        """Return the name that others see; ``wish`` counts only for who was given none."""
+        """Return the name shown to others; ``wish`` is used only for people without a name of their own."""
         return self.name or " ".join("".join(filter(str.isprintable, wish)).split())[:MOST_NAME]
 
 
 class Gate(Protocol):
-    """Decides who sent a request."""
+    """Determines who sent a request."""
 
     #: Whether people can log in with a token.
     takes_tokens: bool
@@ -133,15 +133,15 @@ class Gate(Protocol):
     hint: str
 
     def person(self, scope: Scope) -> Person | None:
-        """Return who sent this request; None if they are not admitted."""
+        """Return who sent this request, or None if they are not admitted."""
 
 
 class OpenGate:
-    """Gives every program of the same user on this machine one role.
+    """Gives one role to every program of the same user on this machine.
 
     Args:
         role: The role.
-        uid_of: Returns the client's user id, given the addresses of both ends.
+        uid_of: Returns the client's user id, given both ends' addresses.
     """
 
     takes_tokens = False
@@ -168,10 +168,10 @@ class Token:
 
 
 class Pairing:
-    """Issues codes that each admit one browser, once and within :data:`PAIRING_S`. Used on the event loop.
+    """Issues codes that admit one browser each, only once and within :data:`PAIRING_S`. Used on the event loop.
 
     Args:
-        role: The role of the browsers that use a code.
+        role: The role given to browsers that use a code.
         clock: The monotonic clock [ns].
     """
 
@@ -184,19 +184,19 @@ class Pairing:
         self._until_ns = 0
 
     def code(self) -> str:
-        """Return a new code, which invalidates the earlier ones."""
+        """Return a new code, which invalidates earlier ones."""
         self._code = secrets.token_urlsafe(24)
         self._until_ns = self._clock() + nanoseconds(PAIRING_S)
         return self._code
 
     def expire(self) -> None:
-        """Drop an expired code; call it a few times a minute."""
+        """Drop the code if it has expired; to be called a few times a minute."""
         if self._code != "" and self._clock() >= self._until_ns:
             self._code = ""
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return who sent a code, and use it up; None if it is not the current one."""
+        """Return who sent a code and use the code up; None if it is not the current one."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
@@ -206,7 +206,7 @@ class Pairing:
 
 
 class TokenGate:
-    """Admits by a token, sent once in exchange for a session cookie or with each request. Used on the event loop."""
+    """Admits people by a token, sent with each request or exchanged for a session cookie. Used on the event loop."""
 
     takes_tokens = True
     hint = "log in with a token"
@@ -226,8 +226,8 @@ class TokenGate:
             tokens: The tokens to accept.
             cookie: The name of the session cookie.
             clock: The monotonic clock [ns].
-            pairing: Issues one-time codes that replace a token.
-            kept: Where sessions are kept across runs of the cockpit.
+            pairing: Issues one-time codes, which can be used in place of a token.
+            kept: Where sessions are stored between runs of the cockpit.
         """
         self.cookie = cookie
         self.pairing = pairing
@@ -236,7 +236,7 @@ class TokenGate:
         self._clock = clock
         self._kept = kept
         saved = [] if kept is None else kept.load()
-        self._sessions = {one.cookie: one for one in saved if self._still_lets_in(one)}  # by the hash of the cookie
+        self._sessions = {one.cookie: one for one in saved if self._still_lets_in(one)}  # by hash of the cookie
 
     def person(self, scope: Scope) -> Person | None:
         header = _header(scope, b"authorization")
@@ -250,11 +250,11 @@ class TokenGate:
         return Person(session.role, session.name) if session is not None and self._clock() < session.until_ns else None
 
     def wrong_token_s(self, scope: Scope) -> float:
-        """Count a wrong token, and return how long to delay its answer [s]."""
+        """Count a wrong token; return how long to delay the answer [s]."""
         return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
-        """Return the owner of a token, None if it is unknown; a nearly right token takes as long as any other."""
+        """Return the owner of a token, None if it is unknown. A nearly right token takes as long as any other."""
         given = token.encode()[: MAX_TOKEN + 1]
         found = None
         for one in self._tokens:
@@ -263,18 +263,18 @@ class TokenGate:
         return found
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
-        """Return who logs in with a token or with a pairing code, which is used up; None if it is neither."""
+        """Return who logs in with a token or a pairing code, which is used up; None if it is neither."""
         found = self.known(token)
         if found is None and self.pairing is not None:
             found = self.pairing.person(token, _address(scope))
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
-        """Begin a session and return its cookie; the oldest sessions make room if there are too many.
+        """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
 
         Args:
             person: The owner of the session.
-            token: The token it was given for.
+            token: The token that the session was given for.
         """
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
@@ -305,7 +305,7 @@ class TokenGate:
 
 
 class CertificateGate:
-    """Admits by the certificate verified in the TLS handshake."""
+    """Admits people by the certificate that the TLS handshake verified."""
 
     takes_tokens = False
     hint = "your certificate names no role: its OU must be pilot or observer"
@@ -318,11 +318,11 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
     """Return the role and name in a certificate.
 
     Args:
-        certificate: As ``SSLObject.getpeercert()`` returns it.
+        certificate: The certificate in the form returned by ``SSLObject.getpeercert()``.
 
     Returns:
-        The role from the organizational unit and the name from the common name; None if no OU, or more than one, is
-        a role.
+        The role from the organizational unit and the name from the common name. None if no OU is a role, or several
+        are.
     """
     if not certificate:
         return None
@@ -338,10 +338,10 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
 def read_tokens(path: Path) -> list[Token]:
     """Read the token file.
 
-    Each line is ``ROLE TOKEN [NAME]``; empty lines and lines that begin with # are skipped.
+    Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped.
 
     Raises:
-        UsageError: The file can't be read, or others may read it.
+        UsageError: The file can't be read, or is readable by others.
         FileFormatError: A line is invalid, or there is no token.
     """
     try:
@@ -376,7 +376,7 @@ def _token(line: str, where: str) -> Token:
 
 
 def _hash(value: str) -> bytes:
-    """Hash a cookie: the time to look up a hash reveals nothing about the cookie."""
+    """Hash a cookie, so that the time taken to look it up reveals nothing about it."""
     return hashlib.sha256(value.encode()).digest()
 
 
@@ -402,26 +402,26 @@ def _cookies(scope: Scope) -> dict[str, str]:
 
 
 class WrongTokens:
-    """Decides how long to delay the answer to a wrong token. Used on the event loop.
+    """Determines how long to delay the answer to a wrong token. Used on the event loop.
 
-    The delay grows with the number of wrong tokens, from the same address and overall. A right token is never delayed,
-    so an attacker can't lock out its owner, not even from the same address. Only *no* gets slower: a guesser who reads
-    the answers gets few of them. One who ignores them, and takes silence for *no*, is limited only by the rate of
-    connections; the length of the tokens protects against that.
+    The delay grows with the number of wrong tokens, both from the same address and overall. A correct token is never
+    delayed, so an attacker can't lock out its owner, not even from the same address. Only rejections get slower: a
+    guesser who waits for the answers gets few of them. A guesser who takes silence for a rejection is limited only by
+    the rate of connections; the length of the tokens protects against that.
 
     Args:
         clock: The monotonic clock [ns].
     """
 
     def __init__(self, clock: Clock = monotonic_ns) -> None:
-        self.count = 0  #: since the start
+        self.count = 0  #: number of wrong tokens since the start
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # how many, and when the last one came; the quietest first
+        self._of_address: dict[str, tuple[int, int]] = {}  # number, and time of the last one; quietest address first
         self._minute_ns = clock()
         self._in_minute = 0
 
     def another(self, address: str) -> float:
-        """Count a wrong token from an address, and return how long to delay its answer [s]."""
+        """Count a wrong token from an address; return how long to delay the answer [s]."""
         now_ns = self._clock()
         before, last_ns = self._of_address.pop(address, (0, now_ns))
         many = 1 if seconds(now_ns - last_ns) >= FORGET_S else before + 1

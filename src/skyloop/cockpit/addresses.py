@@ -1,4 +1,4 @@
-"""Where the page is served: its sockets, its addresses, and the lines printed in the terminal."""
+"""Determine where the page is served: its sockets, its addresses, and the lines printed in the terminal."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.errors import UsageError
 
 DEFAULT_PORT: Final = 8420
-NEXT_PORTS: Final = 9  #: further ports to try if the default is taken
+NEXT_PORTS: Final = 9  #: number of further ports to try if the default is taken
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
-_LISTENS: Final = "0A"  # the state of a listening socket in these tables
-_LOCAL, _STATE, _INODE = 1, 3, 9  # their columns
-_SIOCGIFADDR: Final = 0x8915  # Linux: the IPv4 address of an interface
+_LISTENS: Final = "0A"  # state of a listening socket in the kernel's socket tables
+_LOCAL, _STATE, _INODE = 1, 3, 9  # columns of these tables
+_SIOCGIFADDR: Final = 0x8915  # Linux ioctl that returns an interface's IPv4 address
 _MDNS: Final = Path("/run/avahi-daemon/socket")
 _MAX_COMMAND: Final = 60
 
 
 def bind(address: str, port: int | None) -> socket.socket:
-    """Bind the socket that listens for pages.
+    """Bind the socket on which to listen for pages.
 
     Args:
         address: The address.
-        port: The TCP port; 0: any free one; None: :data:`DEFAULT_PORT`, or the next free one, with a line on standard
-          error that names the program on the default one.
+        port: The TCP port. 0: any free one; None: :data:`DEFAULT_PORT` or, if that is taken, the next free one, with a
+            line on standard error that names the program using the default.
 
     Raises:
         UsageError: The port is taken or unusable.
@@ -53,7 +53,7 @@ def _bind(address: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((address, port))
-        listening.listen(0)  # at once: two programs may bind one port until either listens
+        listening.listen(0)  # listen at once: two programs may bind the same port until one of them listens
     except (OSError, OverflowError) as error:
         listening.close()
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
@@ -68,7 +68,7 @@ def _by(port: int) -> str:
 
 
 def listener_of(port: int) -> str:
-    """Return which of this user's programs listens on a port: process and command line; empty if none is found."""
+    """Return the process and command line of this user's program that listens on a port; empty if there is none."""
     inodes = set()
     for table in _TABLES:
         with suppress(OSError):
@@ -80,7 +80,7 @@ def listener_of(port: int) -> str:
         return ""
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
-            with suppress(OSError):  # another user's process, or one that has ended
+            with suppress(OSError):  # another user's process, or it has ended
                 if any(str(entry.readlink()) in inodes for entry in (process / "fd").iterdir()):
                     command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
                     return f"process {process.name} ({command[:_MAX_COMMAND]})"
@@ -88,9 +88,9 @@ def listener_of(port: int) -> str:
 
 
 def reachable(address: str) -> list[str]:
-    """Return the addresses at which others reach a service bound to ``address``, the best one first.
+    """Return the addresses at which others can reach a service bound to ``address``, best first.
 
-    On a machine without a network, that is its loopback address.
+    If the machine has no network, return its loopback address.
 
     Args:
         address: An address of this machine, ``0.0.0.0`` or ``::``.
@@ -104,15 +104,15 @@ def reachable(address: str) -> list[str]:
     found = []
     for family, somewhere in families:
         with suppress(OSError), closing(socket.socket(family, socket.SOCK_DGRAM)) as probe:
-            probe.connect((somewhere, 9))  # sends nothing: it only selects our address for that route
+            probe.connect((somewhere, 9))  # this sends nothing; it only selects our address for that route
             found.append(str(probe.getsockname()[0]))
     return found or own_addresses() or ["127.0.0.1" if known.version == 4 else "::1"]
 
 
 def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine's networks, in the order of its interfaces; empty except on Linux.
+    """Return the IPv4 addresses of this machine on its networks, ordered by interface; empty except on Linux.
 
-    Needed in networks without a default route: a drone's own Wi-Fi, or a lab without internet.
+    Needed on networks that have no default route, such as a drone's own Wi-Fi or a lab without internet access.
     """
     if sys.platform != "linux":
         return []
@@ -121,20 +121,20 @@ def own_addresses() -> list[str]:
     found = []
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as any_socket:
         for _, name in socket.if_nameindex():
-            with suppress(OSError):  # it has no address
+            with suppress(OSError):  # the interface has no address
                 answer = ioctl(any_socket, _SIOCGIFADDR, struct.pack("256s", name.encode()))
                 found.append(socket.inet_ntoa(answer[20:24]))
     return [address for address in found if not ipaddress.ip_address(address).is_loopback]
 
 
 def host_names() -> tuple[str, ...]:
-    """Return the names of this machine: its host name, and its multicast DNS name where a program answers for it."""
+    """Return this machine's host name, and its multicast DNS name if a program answers for that."""
     name = socket.gethostname()
     return (name, f"{name.partition('.')[0]}.local") if _MDNS.exists() else (name,)
 
 
 def qr_code(text: str) -> str:
-    """Return a QR code for a terminal, in half blocks; empty if the library is missing."""
+    """Return a QR code for a terminal, drawn in half blocks; empty if the library is missing."""
     try:
         import segno
     except ImportError:
@@ -147,14 +147,14 @@ def qr_code(text: str) -> str:
 
 
 class Announcer:
-    """Prints the page's address, with a QR code for phones if others can reach it and the terminal can show one.
+    """Prints the page's address, with a QR code for phones if others can reach the page and the terminal can show one.
 
-    With pairing, the address in the QR code carries the code after the ``#``, the part that browsers never send. The
-    next code is printed as soon as the last one was used or has expired.
+    With pairing, the address in the QR code contains the pairing code after the ``#``, in the part that browsers never
+    send. The next code is printed as soon as the last one has been used or has expired.
 
     Args:
-        pairing: Issues the codes; None: everyone is admitted, or people have tokens.
-        loopback: Whether only this machine reaches it.
+        pairing: Issues the codes; None if everyone is admitted or people have tokens.
+        loopback: Whether only this machine can reach the page.
     """
 
     def __init__(self, pairing: Pairing | None, loopback: bool) -> None:

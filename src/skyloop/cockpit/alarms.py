@@ -1,4 +1,4 @@
-"""The alarms of a drone: pure decisions from links, feedback and ages.
+"""Determine a drone's alarms: pure decisions from links, feedback and ages.
 
 The thresholds are parameters of the drone's proxy, so they are the same on every page.
 """
@@ -33,12 +33,12 @@ class AlarmSeverity(StrEnum):
 
 
 class Alarm(msgspec.Struct, frozen=True):
-    """A problem that exists now.
+    """A problem that currently exists.
 
     Args:
-        id: Its subject, constant while it lasts: a page uses it to remember that a person acknowledged the alarm.
-        severity: It may rise while the alarm lasts, as from a degraded link to a lost one.
-        text: In words, with the current value.
+        id: Its subject, constant while the alarm lasts: lets a page remember that a person acknowledged it.
+        severity: May rise while the alarm lasts, for example when a degraded link is lost.
+        text: A description that includes the current value.
     """
 
     id: str
@@ -47,7 +47,7 @@ class Alarm(msgspec.Struct, frozen=True):
 
 
 class Thresholds(msgspec.Struct, frozen=True):
-    """Where alarms begin: charges from 0 to 1, ages in seconds; 0: never."""
+    """The values at which alarms start: charges from 0 to 1, ages in seconds; 0 means never."""
 
     battery_low: float = 0.2
     battery_critical: float = 0.15
@@ -60,13 +60,13 @@ USUAL: Final = Thresholds()
 
 
 class DegradedTimes:
-    """How long each hop has been degraded without a break."""
+    """Tracks for how long each hop has been degraded without interruption."""
 
     def __init__(self) -> None:
         self._since_ns: dict[str, int] = {}
 
     def update(self, link: LinkStatus, now_ns: int) -> dict[str, float]:
-        """Take the current state, and return how long each degraded hop has been so [s], by the ``id`` of its alarm."""
+        """Record the current state; return how long each degraded hop has been degraded [s], by its alarm's ``id``."""
         degraded = [hop for hop, _, state in _hops(link) if state is LinkState.DEGRADED]
         self._since_ns = {hop: self._since_ns.get(hop, now_ns) for hop in degraded}
         return {hop: seconds(now_ns - since_ns) for hop, since_ns in self._since_ns.items()}
@@ -80,23 +80,23 @@ def alarms(
     degraded_s: Mapping[str, float],
     thresholds: Thresholds = USUAL,
 ) -> list[Alarm]:
-    """Return the alarms of this moment, the most severe first.
+    """Return the current alarms, the most severe first.
 
     Args:
         link: The state of both hops.
-        feedback: The newest, None for none.
-        feedback_age_s: Its age [s].
+        feedback: The newest feedback, or None.
+        feedback_age_s: Age of that feedback [s].
         video_age_s: Age of the frame shown [s], for each camera that is watched.
-        degraded_s: How long each degraded hop has been so [s], from :class:`DegradedTimes`.
+        degraded_s: How long each degraded hop has been degraded [s], from :class:`DegradedTimes`.
         thresholds: The limits for charges, ages and degraded links.
     """
-    # On the ground there is time: only a vehicle that is in the air, or was at last report, is urgent.
+    # On the ground there is time: an alarm is urgent only if the vehicle is, or was last reported, in the air.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
     if link.application in _BROKEN:
-        # Everything else is out of date.
+        # All other information is out of date.
         return [urgent("application_link", _because("link to the proxy lost", link.reason))]
     if link.vehicle is LinkState.CLOSED:
-        return []  # a replay that has reached its end: nothing is wrong
+        return []  # nothing is wrong: a replay has reached its end
     found = [*_of_flight(feedback, thresholds, urgent), *_of_links(link, degraded_s, thresholds, urgent)]
     if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
         found.append(urgent("feedback_age", f"feedback is {feedback_age_s:.1f} s old"))
@@ -152,8 +152,8 @@ def _because(what: str, *more: str) -> str:
     return ": ".join((what, *filter(None, more)))
 
 
-RETRY_S: Final = 2.0  #: between two attempts to read the parameters
-#: The parameters, by field of :class:`Thresholds`.
+RETRY_S: Final = 2.0  #: pause between attempts to read the parameters
+#: The proxy's parameters, keyed by field of :class:`Thresholds`.
 PARAMETERS: Final = {
     "battery_low": "battery.warn",
     "battery_critical": "alarms.battery_critical",
@@ -170,9 +170,9 @@ class _Readable(Protocol):
 
 
 class ThresholdReader:
-    """Reads the thresholds, and reads them again after a parameter was written or a link came back.
+    """Reads the thresholds, and reads them again after a parameter was written or a link was restored.
 
-    Made and used on the event loop.
+    Created and used on the event loop.
 
     Args:
         drone: The drone.
@@ -196,7 +196,7 @@ class ThresholdReader:
             self._is_stale, self._tried_ns = True, None
 
     def newest(self) -> Thresholds:
-        """Return the thresholds last read, and start to read them if they may have changed. Does not block."""
+        """Return the thresholds last read; start reading them again if they may have changed. Does not block."""
         now_ns = self._clock()
         rested = self._tried_ns is None or now_ns - self._tried_ns >= nanoseconds(RETRY_S)
         if self._is_stale and rested and self._task is None:
@@ -212,13 +212,13 @@ class ThresholdReader:
         try:
             self._values = await asyncio.to_thread(thresholds_of, self._drone.config)
         except SkyloopError:
-            self._is_stale = True  # no answer: retry after RETRY_S
+            self._is_stale = True  # no answer: try again after RETRY_S
         finally:
             self._task = None
 
 
 def thresholds_of(config: _Readable) -> Thresholds:
-    """Read the thresholds; the default replaces any that the proxy lacks or that is not finite.
+    """Read the thresholds; use the default for any that the proxy lacks or that is not finite.
 
     Raises:
         SkyloopError: The proxy does not answer.

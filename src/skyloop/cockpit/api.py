@@ -1,4 +1,4 @@
-"""HTTP requests, answered in JSON, entirely or not at all; :mod:`.security` has decided who may send them."""
+"""HTTP requests answered in JSON, either completely or not at all; :mod:`.security` decides who may send them."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
-LARGEST_BODY: Final = 65_536  #: bytes
+LARGEST_BODY: Final = 65_536  #: maximum size of a request's body [bytes]
 BODY_S: Final = 10.0  #: time limit for receiving a request's body
 _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
-    (ClosedError, 404),  # a replay that has ended meanwhile
+    (ClosedError, 404),  # a replay that has ended in the meantime
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),
@@ -50,8 +50,8 @@ _STATUS: Final = (
 
 T = TypeVar("T")
 Handler = Callable[[Any, Request], Awaitable[Response]]
-MAX_ASKING: Final = 4  #: parameter requests to proxies at one time; each may block its thread for seconds
-MOST_CHECKS: Final = 4  #: route checks at one time; each asks a proxy and may block its thread for seconds
+MAX_ASKING: Final = 4  #: simultaneous parameter requests to proxies; each may block its thread for seconds
+MOST_CHECKS: Final = 4  #: simultaneous route checks; each queries a proxy and may block its thread for seconds
 
 
 class BadRequest(Exception):  # noqa: N818  (HTTP's name for it)
@@ -63,7 +63,7 @@ class BadRequest(Exception):  # noqa: N818  (HTTP's name for it)
 
 
 def answered(handler: Handler) -> Handler:
-    """Turn exceptions of a handler into an answer with a status and ``{"error": why}``."""
+    """Convert a handler's exceptions into an answer with a status and ``{"error": why}``."""
 
     @wraps(handler)
     async def answer(self: Any, request: Request) -> Response:
@@ -81,10 +81,10 @@ def answered(handler: Handler) -> Handler:
 
 
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Run work for a request, and cancel it once the client has disconnected.
+    """Do work for a request, but cancel it if the client disconnects.
 
     Returns:
-        What ``work`` returns.
+        The result of ``work``.
 
     Raises:
         ClientDisconnect: The client has disconnected.
@@ -107,25 +107,25 @@ async def _gone(request: Request) -> None:
 
 
 def answer_json(values: Any, status: int = 200) -> Response:
-    """Make an answer."""
+    """Create an answer."""
     return Response(encode_json(values), status, media_type=_JSON)
 
 
 def check_json(request: Request) -> None:
-    """Check the content type: browsers ask before they send this one for another site, and are refused."""
+    """Check the content type. Browsers must ask before sending this one on behalf of another site, and are refused."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
         raise BadRequest(415, f"the content type must be {_JSON}")
 
 
 async def body_of(request: Request, kind: type[T]) -> T:
-    """Read a request's body.
+    """Read and decode a request's body.
 
     Args:
         request: The request.
         kind: The type to decode.
 
     Raises:
-        BadRequest: The body is not JSON, too large, incomplete in time, or of another type.
+        BadRequest: The body is not JSON, is too large, does not arrive in time, or has the wrong type.
     """
     check_json(request)
     data = b""
@@ -153,10 +153,10 @@ class Api:
     Args:
         fleet: The drones.
         gate: Decides who is admitted.
-        counts: The messages sent to pages.
+        counts: Counts of the messages sent to pages.
         scheme: ``http`` or ``https``.
         admission: The open connections.
-        authority: PEM certificate of the authority that signed this server's; None if the cockpit made none.
+        authority: PEM certificate of the authority that signed the server's; None if the cockpit created none.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class Api:
     # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
-        """Answer with the role of the client; null for strangers, with a hint on how to log in."""
+        """Answer with the client's role, or with null for strangers, and a hint on how to log in."""
         person = person_of(request.scope)
         return answer_json(
             {
@@ -204,7 +204,7 @@ class Api:
 
     @answered
     async def login(self, request: Request) -> Response:
-        """Exchange a token for a session cookie; the answer to a wrong token is delayed."""
+        """Exchange a token for a session cookie; delay the answer to a wrong token."""
         gate = self._gate
         if not isinstance(gate, TokenGate):
             raise BadRequest(404, "this cockpit uses no tokens")
@@ -240,7 +240,7 @@ class Api:
 
     @answered
     async def authority(self, _: Request) -> Response:
-        """Answer with the certificate that browsers should trust, as a file."""
+        """Answer with the certificate for browsers to trust, as a file."""
         if self._authority is None:
             raise BadRequest(404, "this cockpit made no certificate: start it with --https")
         answer = Response(self._authority, media_type="application/x-x509-ca-cert")
@@ -302,7 +302,7 @@ class Api:
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter as JSON values, with everything needed to edit it."""
+    """Return a parameter as JSON values, including everything needed to edit it."""
     return {
         "name": parameter.name,
         "type": str(parameter.type),
@@ -319,12 +319,12 @@ def parameter_values(parameter: Parameter) -> dict[str, Any]:
 
 
 def _value(value: Value) -> Any:
-    """Return a value for JSON; the encoder turns numbers that are not finite into null."""
+    """Return a value for JSON; the encoder converts numbers that are not finite to null."""
     return list(value) if isinstance(value, tuple) else value
 
 
 class RoutesApi:
-    """The routes below ``/api/routes``, and the check of a route for a drone.
+    """The routes below ``/api/routes``, and the check of a route for one drone.
 
     Args:
         fleet: The drones.
@@ -348,7 +348,7 @@ class RoutesApi:
 
     @answered
     async def check(self, request: Request) -> Response:
-        """Answer with the problems of a route for a drone, and the ``id`` to fly it by."""
+        """Answer with a route's problems for a drone, and the ``id`` by which to fly it."""
         name, stations = request.path_params["name"], self._fleet.stations
         if name not in stations:
             raise UnknownNameError("drone", name, stations)
@@ -360,18 +360,18 @@ class RoutesApi:
 
     @answered
     async def listing(self, _: Request) -> Response:
-        """Answer with the routes stored here."""
+        """Answer with the stored routes."""
         return answer_json(await asyncio.to_thread(self._files.listing))
 
     @answered
     async def load(self, request: Request) -> Response:
-        """Answer with the file of a route."""
+        """Answer with a route's file."""
         route = await asyncio.to_thread(self._files.load, request.path_params["name"])
         return Response(route.to_json(), media_type="application/json")
 
     @answered
     async def save(self, request: Request) -> Response:
-        """Store a route under a name."""
+        """Store a route under the given name."""
         name, route = request.path_params["name"], parse_route(bytes(await body_of(request, msgspec.Raw)))
         await asyncio.to_thread(self._files.save, name, route)
         return answer_json({"name": name}, 201)

@@ -6,7 +6,7 @@
 ``/ws/overview``                        to the page: all drones, twice a second
 ``/ws/control``                         from the page: commands to all drones; to the page: their outcome
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
-``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
+``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, in JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
 ``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, who has control
 ======================================  ==================================================================
@@ -56,7 +56,7 @@ from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
-SMALLEST_PACKED: Final = 1000  #: bytes; compressing less saves nothing
+SMALLEST_PACKED: Final = 1000  #: bytes; compressing less than this gains nothing
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
@@ -65,20 +65,20 @@ _FOR_GOOD: Final = "private, max-age=31536000, immutable"
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A file as read; ``stamp`` shows whether it has changed since."""
+    """A file's content; ``stamp`` shows whether the file has changed since it was read."""
 
     stamp: tuple[int, int]
     kind: str
     hash: str
     plain: bytes
-    packed: bytes | None  #: None: sent uncompressed
+    packed: bytes | None  #: None if it is sent uncompressed
 
 
 class PageFiles(StaticFiles):
-    """Serves the page's folder.
+    """Serves the folder that contains the page.
 
     Args:
-        folder: The folder; it may be missing.
+        folder: The folder; it need not exist.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -100,7 +100,7 @@ class PageFiles(StaticFiles):
         return self._answer(file, Headers(scope=scope), _FOR_GOOD if for_good else "no-cache")
 
     async def page(self) -> Response:
-        """Return the page itself, with file names that carry a hash of their content."""
+        """Return the page, in which file names carry a hash of their content."""
         try:
             text = self._index.read_text()
         except OSError:
@@ -131,7 +131,7 @@ class PageFiles(StaticFiles):
         stamp = (found.st_mtime_ns, found.st_size)
         file = self._files.get(full)
         if file is None or file.stamp != stamp:
-            # On a thread: compressing the 3-D view takes some 30 ms, and pilots' commands must not wait for it.
+            # Use a thread: compressing the 3-D view takes some 30 ms, and pilots' commands must not wait for it.
             file = self._files[full] = await asyncio.to_thread(_read, full, stamp)
         return file
 
@@ -145,17 +145,17 @@ def _read(full: str, stamp: tuple[int, int]) -> _File:
 
 
 STATIC = Path(__file__).with_name("static")
-_THREADS: Final = 32  # for work that blocks: proxies that answer late, recorders that end
+_THREADS: Final = 32  # for blocking work: proxies that answer late, recorders that take time to end
 
 
 class Cockpit:
-    """The page and the WebSockets.
+    """Serves the page and the WebSockets.
 
     Args:
         fleet: The drones.
         recordings: The recordings of the same drones.
         static: The page's folder.
-        follower: Creates followers for targets marked on a page.
+        follower: Creates a follower for each target marked on a page.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
@@ -183,17 +183,17 @@ class Cockpit:
         return await self.files.page()
 
     async def overview(self, socket: WebSocket) -> None:
-        """Send all drones to a page."""
+        """Send the overview of all drones to a page."""
         await socket.accept()
         await BroadcastSender(socket, self._overview.broadcast).run()
 
     async def small_video(self, socket: WebSocket) -> None:
-        """Send small video of many drones to a page."""
+        """Send small video streams of many drones to a page."""
         await socket.accept()
         await SmallVideoSender(socket, self._fleet.stations, self.counts).run()
 
     async def all_drones(self, socket: WebSocket) -> None:
-        """Accept a pilot's commands to all drones."""
+        """Accept a pilot's commands that apply to all drones."""
         await socket.accept()
         person = person_of(socket.scope)
         if person is None or not person.may(Role.PILOT):
@@ -224,7 +224,7 @@ class Cockpit:
         await VideoSender(socket, station, feed, self.counts).run()
 
     async def control(self, socket: WebSocket) -> None:
-        """Accept a pilot's commands to one drone."""
+        """Accept a pilot's commands for one drone."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -237,7 +237,7 @@ class Cockpit:
         await ControlSession(socket, station, name, photos=photos, follower=self._follower).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
-        """Return the station of the requested drone; None, with the socket closed, if there is none."""
+        """Return the station of the requested drone; if there is none, close the socket and return None."""
         station = self._fleet.stations.get(socket.path_params["name"])
         await socket.accept()
         if station is None:
@@ -262,13 +262,13 @@ def create_app(
     Args:
         fleet: The drones.
         recordings: The recordings of the same drones.
-        names: The only host names to answer to.
+        names: The only host names that are answered.
         gate: Decides who is admitted.
         static: The page's folder.
         admission: Counts the connections.
-        world: The surroundings of drones that don't report them.
-        follower: Creates followers for targets marked on a page.
-        page_authority: PEM certificate of the authority that signed this server's, for browsers that should trust it.
+        world: The surroundings to show for drones that don't report any.
+        follower: Creates a follower for each target marked on a page.
+        page_authority: PEM certificate of the authority that signed the server's certificate, for browsers to trust.
     """
     cockpit = Cockpit(fleet, recordings, static, follower)
     api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission(), page_authority)

@@ -1,4 +1,4 @@
-"""The cockpit as a child process, for programs that show a page beside their own work."""
+"""Run the cockpit as a child process, for programs that show a page while doing their own work."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _ASK_S = 2.0
 class CockpitProcess:
     """Runs ``python -m skyloop.cockpit [NAME]`` as a child process.
 
-    The child ends with :meth:`close`, or with this process, however that ends. It ignores Ctrl-C.
+    The child ends on :meth:`close`, or when this process ends for any reason. It ignores Ctrl-C.
     """
 
     def __init__(self, name: str | None = None, port: int | None = 0, recordings: Path | None = None) -> None:
         """Start the child without waiting for the page; see :meth:`address`.
 
         Args:
-            name: The proxy to show (default: all).
-            port: The port on loopback; 0 selects a free one, None the default port or the next free one.
+            name: The proxy to show; all by default.
+            port: The loopback port; 0 selects a free one, None the default or the next free one.
             recordings: The folder for recordings.
         """
         names = [] if name is None else [name]
@@ -65,7 +65,7 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """Return counts of the messages sent to its pages: see ``/api/statistics``.
+        """Return the counts of messages sent to its pages, as in ``/api/statistics``.
 
         Raises:
             LinkError: The cockpit does not answer.
@@ -78,11 +78,11 @@ class CockpitProcess:
             raise LinkError(f"the cockpit does not answer: {error}") from error
 
     def close(self) -> None:
-        """End the child and wait for it. Idempotent."""
+        """End the child and wait until it has ended. Idempotent."""
         self._process.close()
 
     def _complaint(self) -> str:
-        """Return the last line of the child's standard error, if it has ended."""
+        """Return the last line of the child's standard error if it has ended."""
         code = self._process.wait(0.5)
         if code is None:
             return "no answer in time"

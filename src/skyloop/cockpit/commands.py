@@ -1,4 +1,4 @@
-"""A page's commands: one JSON object per message, with the kind in ``do``; and whether one is in time."""
+"""Commands from a page: one JSON object per message, with the command's kind in ``do``; and their timeliness."""
 
 from __future__ import annotations
 
@@ -15,54 +15,54 @@ CameraName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
-LATE_S: Final = 0.5  #: a command that may be older is refused: its sender no longer expects it to happen
-#: An emergency stop may be this late: as long as the page shows it as pending.
+LATE_S: Final = 0.5  #: a command that may be older is refused, because its sender no longer expects it to be obeyed
+#: An emergency stop may be this late, which is how long the page shows it as pending.
 STOP_LATE_S: Final = 2.0
-#: Pushed sticks that have not moved for this long count as held by no hand. Bluetooth reports a lost gamepad only
-#: after up to 20 s.
+#: If pushed sticks have not moved for this long, nobody is assumed to hold them. Bluetooth can take up to 20 s to
+#: report a lost gamepad.
 UNTOUCHED_S: Final = 10.0
-AHEAD_S: Final = 0.05  #: tolerated clock difference beyond the page's own bound, as for programs' commands
-SETTLED_NS: Final = 50_000_000  #: feedback captured this soon after a command may predate it [ns]
+AHEAD_S: Final = 0.05  #: clock difference tolerated beyond the page's own bound, the same as for programs' commands
+SETTLED_NS: Final = 50_000_000  #: feedback captured within this time after a command may predate it [ns]
 
 
 class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):
-    """Base of all commands from a page."""
+    """The base of all commands from a page."""
 
-    #: When the person requested it, on the cockpit's clock as the page knows it from pongs [s].
+    #: When the person requested it, on the cockpit's clock as the page estimates it from pongs [s].
     at_s: float | None = None
     unsure_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  #: uncertainty of ``at_s`` [s]
-    n: int = 0  #: repeated in the answers
+    n: int = 0  #: number that answers repeat
 
     @property
     def do(self) -> str:
-        """The command's kind, as messages name it."""
+        """The command's kind, as it appears in messages."""
         return str(self.__struct_config__.tag)
 
 
 class Take(Command, frozen=True, tag="take"):
-    """Ask for the authority: 0 is the highest priority, 31 the lowest."""
+    """Request control authority with a priority from 0, the highest, to 31."""
 
     priority: Priority
-    ask: bool = False  #: ask the holder first and wait in the queue
+    ask: bool = False  #: ask the holder first, and wait in the queue
 
 
 class Release(Command, frozen=True, tag="release"):
-    """Give the authority back, or leave the queue."""
+    """Give up the authority, or leave the queue."""
 
 
 class Answer(Command, frozen=True, tag="answer"):
-    """The holder's answer to a request for the authority."""
+    """The holder's answer to a request for its authority."""
 
-    id: int  #: of the question
+    id: int  #: id of the question
     grant: bool
-    reason: Reason = ""  #: reason for a refusal, shown to a person
+    reason: Reason = ""  #: reason for a refusal, shown to the person who asked
 
 
 class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover on a person's request; or automatically, as nothing is held, without taking the vehicle from others."""
+    """Hover as a person requested; or automatically, because no key or stick is held, without taking it from others."""
 
     automatic: bool = False
 
@@ -71,26 +71,26 @@ class LandHere(Command, frozen=True, tag="land"): ...
 
 
 class Stop(Command, frozen=True, tag="stop"):
-    """Cut the motors; needs no authority."""
+    """Cut the motors. This needs no authority."""
 
 
 class Reset(Command, frozen=True, tag="reset"):
-    """Leave the emergency state."""
+    """Leave the vehicle's emergency state."""
 
 
 class Fly(Command, frozen=True, tag="fly"):
-    """Sticks: velocity in the body's levelled axes [m/s], yaw rate counter-clockwise [rad/s]."""
+    """Move the sticks: velocity in the levelled body axes [m/s], yaw rate counter-clockwise [rad/s]."""
 
     forward: float = 0.0
     left: float = 0.0
     up: float = 0.0
     yaw_rate: float = 0.0
-    #: Grows with each sign of a hand: moving fingers, repeating keys, raw axes. None: the page does not report it.
+    #: Increases with each sign of a hand: moving fingers, repeating keys, raw axes. None if it is not reported.
     touches: int | None = None
 
 
 class GoTo(Command, frozen=True, tag="goto"):
-    """Fly to a place in world axes: east, north, up [m], yaw counter-clockwise from east [rad]."""
+    """Fly to a place in world axes: east, north and up [m], yaw counter-clockwise from east [rad]."""
 
     x: float
     y: float
@@ -99,11 +99,11 @@ class GoTo(Command, frozen=True, tag="goto"):
 
 
 class FlyBack(Command, frozen=True, tag="return"):
-    """Fly back to the place of take-off, and land or hover there, as the drone's parameters say."""
+    """Fly back to the take-off position and land or hover there, depending on the drone's parameters."""
 
 
 class FlyRoute(Command, frozen=True, tag="route"):
-    """Fly along a checked route; ``id`` comes from the answer to the check."""
+    """Fly a checked route; ``id`` comes from the answer to the check."""
 
     id: Annotated[str, msgspec.Meta(max_length=64)]
 
@@ -113,7 +113,7 @@ class PauseRoute(Command, frozen=True, tag="route_pause"):
 
 
 class ResumeRoute(Command, frozen=True, tag="route_resume"):
-    """Continue to the next waypoint."""
+    """Continue to the next waypoint of a paused route."""
 
 
 class SkipWaypoint(Command, frozen=True, tag="route_skip"):
@@ -125,25 +125,25 @@ class StopRoute(Command, frozen=True, tag="route_stop"):
 
 
 class SelectTarget(Command, frozen=True, tag="follow_select"):
-    """Keep the frames of a camera while a person draws a box on one of them; None: stop keeping them."""
+    """Keep a camera's frames while a person draws a box on one of them; None: stop keeping them."""
 
     camera: CameraName | None
 
 
 class FollowTarget(Command, frozen=True, tag="follow"):
-    """Track the content of a box, and fly after it if a mode is given."""
+    """Track the content of a box and, if a mode is given, follow it."""
 
     camera: CameraName
-    captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: of the frame under the box [ns]
-    box: tuple[float, float, float, float]  #: x, y of its upper left corner, width and height [pixels]
-    mode: Word | None = None  #: None: only track, until a mode is set
-    class_name: Word | None = None  #: of a selected detection
+    captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: capture time of the frame under the box [ns]
+    box: tuple[float, float, float, float]  #: x and y of its upper left corner, width and height [pixels]
+    mode: Word | None = None  #: None: only track until a mode is set
+    class_name: Word | None = None  #: class of a selected detection
     distance_m: float | None = None  #: distance to keep; None: the follower's default
-    size: tuple[Pixels, Pixels] | None = None  #: of the picture under the box; None: the frame's
+    size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None: the frame's size
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
-    """Fly after the tracked target, or change the mode of following."""
+    """Follow the tracked target, or change the mode of following."""
 
     mode: Word
     distance_m: float | None = None  #: distance to keep; None: unchanged
@@ -161,7 +161,7 @@ class Write(Command, frozen=True, tag="set"):
 
 
 class Alive(Command, frozen=True, tag="ping"):
-    """Report that the page is present and receives: ``seen_s`` is the ``now_s`` of its newest pong."""
+    """Report that the page is present and receives data: ``seen_s`` is the ``now_s`` in its newest pong."""
 
     seen_s: float | None = None
 
@@ -171,7 +171,7 @@ class LandAll(Command, frozen=True, tag="land_all"):
 
 
 class StopAll(Command, frozen=True, tag="stop_all"):
-    """Cut the motors of every drone; needs no authority."""
+    """Cut the motors of every drone. This needs no authority."""
 
 
 AnyCommand = (
@@ -206,57 +206,57 @@ _fleet_decoder = msgspec.json.Decoder(AnyFleetCommand)
 
 
 def decode_command(text: str | bytes) -> AnyCommand:
-    """Decode a command to one drone.
+    """Decode a command for one drone.
 
     Raises:
-        DecodeError: It is not a valid command; the message says what is wrong.
+        DecodeError: The command is invalid; the message says why.
     """
     command: AnyCommand = _decoded(_decoder, text)
     return command
 
 
 def decode_fleet_command(text: str | bytes) -> AnyFleetCommand:
-    """Decode a command to all drones.
+    """Decode a command for all drones.
 
     Raises:
-        DecodeError: It is not a valid command; the message says what is wrong.
+        DecodeError: The command is invalid; the message says why.
     """
     command: AnyFleetCommand = _decoded(_fleet_decoder, text)
     return command
 
 
 def late_s(command: Command) -> float:
-    """Return the age at which a command is too old [s]."""
+    """Return the age from which a command counts as late [s]."""
     return STOP_LATE_S if isinstance(command, Stop | StopAll) else LATE_S
 
 
 class HandWatch:
-    """Whether a hand holds the pushed sticks. Pure.
+    """Determines whether a hand holds the pushed sticks. Pure.
 
-    Hands are never still: a finger moves by pixels, a held key repeats, an axis at its end trembles. A gamepad that
-    lost its radio link is still, and so is a page that lost track of the keys held.
+    Hands are never still: a finger moves by pixels, a held key repeats, an axis at its limit jitters. The values from a
+    gamepad that has lost its radio link stay constant, as do those of a page that has lost track of held keys.
     """
 
     def __init__(self) -> None:
-        """Begin with untouched sticks."""
+        """Start with untouched sticks."""
         self._last: Fly | None = None
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Return whether the sticks showed a hand within :data:`UNTOUCHED_S`; call it with each stick command."""
+        """Return whether the sticks showed a hand within :data:`UNTOUCHED_S`; to be called for each stick command."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
         )
-        if not same or sticks.touches is None:  # a pause is no sign of a hand: networks cause them, too
+        if not same or sticks.touches is None:  # a pause is not a sign of a hand: networks cause pauses, too
             self._moved_s = now_s
         return now_s - self._moved_s <= UNTOUCHED_S
 
 
 def untimely(command: Command, now_s: float) -> str:
-    """Return the reason to refuse a command for its age; empty if it is in time.
+    """Return the reason to refuse a command because of its age; empty if it is in time.
 
-    A command whose age is unknown is refused, and one that may be too old counts as too old.
+    A command whose age is unknown is refused, and one that might be too old is treated as too old.
 
     Args:
         command: The command.

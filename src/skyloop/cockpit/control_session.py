@@ -1,12 +1,12 @@
-"""One page's control of one drone: turns the page's messages into commands for the vehicle, and answers them.
+"""One page's control of one drone: convert the page's messages to commands for the vehicle, and answer them.
 
 A command that arrives in time (:func:`skyloop.cockpit.commands.untimely`) is carried out; any other is refused and
-never carried out later. Only the hover of released sticks is carried out at any age.
+never carried out later. Only the hover sent for released sticks is carried out whatever its age.
 
-The page has a dead-man switch: if it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
-vehicle hovers. A page that has not confirmed receiving from the cockpit for :data:`GONE_S` counts as a silent pilot:
-the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts, as for any
-program. When the page's connection ends, the vehicle hovers at once and the authority is released.
+The page has a dead-man switch: if it flies with sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
+vehicle hovers. A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated as a
+silent pilot: the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts, as it
+would for any program. When the page's connection ends, the vehicle hovers at once and the authority is released.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 
-SILENT_S: Final = 0.5  #: a page that flies and sends nothing for this long counts as dead
-#: A page that receives nothing from the cockpit for this long flies nothing, and its control expires.
+SILENT_S: Final = 0.5  #: a page that flies but sends nothing for this long is considered dead
+#: A page that receives nothing from the cockpit for this long can't fly, and its control expires.
 GONE_S: Final = 2.0
-_REFUSE_AGAIN_S: Final = 1.0  # between equal refusals of stick commands, which arrive 20 times a second
+_REFUSE_AGAIN_S: Final = 1.0  # interval between equal refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-# A take-off is no longer repeated if the proxy has not acknowledged it, or the vehicle not begun it, by then.
+# A take-off is no longer repeated if by then the proxy has not acknowledged it or the vehicle has not begun it.
 _TAKEOFF_NS: Final = 1_000_000_000
 _BEGUN_NS: Final = 6_000_000_000
 _numbers = itertools.count(1)
@@ -82,7 +82,7 @@ Json = dict[str, Any]
 
 
 class ControlSession:
-    """Serves one control socket of a page, from open to close. On the event loop."""
+    """Serves one control socket of a page from opening to closing. On the event loop."""
 
     def __init__(
         self,
@@ -97,41 +97,41 @@ class ControlSession:
         """Prepare the session; :meth:`run` serves it.
 
         Args:
-            socket: Already accepted.
+            socket: The socket, already accepted.
             station: The drone.
-            person: The name of the person who flies, if known.
+            person: The pilot's name, if known.
             clock: The monotonic clock [ns].
-            photos: The folder for photos of routes; each drone has a subfolder.
+            photos: The folder for photos taken along routes; each drone has a subfolder.
             follower: Creates followers for targets that the page marks.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._station = station
         self._clock = clock
-        #: The name that other applications see.
+        #: The name shown to other applications.
         self.app = f"{person} (cockpit {next(_numbers)})" if person else f"cockpit {next(_numbers)}"
         self._pilot: PilotConnection | None = None
         self._jobs: set[asyncio.Task[None]] = set()
-        self._turn = asyncio.Lock()  # one job at a time waits for the proxy
+        self._turn = asyncio.Lock()  # only one job at a time waits for the proxy
         self._place = PlaceFlight(station, self.app, self._done, self._refuse)
         self._follow = FollowSession(station.drone, self._send, self._end_flight, follower, clock)
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
-        self._steering = False  # the newest set-point is a velocity from this page's sticks
-        self._stood_down = False  # stood down with the vehicle under way, and nothing commanded since
+        self._steering = False  # whether the newest set-point is a velocity from this page's sticks
+        self._stood_down = False  # whether it stood down with the vehicle under way, and has commanded nothing since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._decided = ("", 0)  # do, n of the page's last decision, which may still be refused or waiting
-        # The last command that replaced another, and its first intent.
+        self._decided = ("", 0)  # ``do`` and ``n`` of the page's last decision, which may still be refused or waiting
+        # The last command that replaced another one, and its first intent.
         self._last_command, self._first = ("", 0), 0
-        self._decisions = 0  # counts commands that fly or end a flight; jobs that waited compare it
+        self._decisions = 0  # counts commands that fly or end a flight; compared by jobs that have waited
         self._hands = HandWatch()
         self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
-            None  # do, n, until in which states, since when
+            None  # do, n, states that complete it, time of the start
         )
-        self._repeated = False  # the take-off was repeated for as long as allowed
-        self._last_refusal = ("", -_REFUSE_AGAIN_S)  # of stick commands: reason and time [s]
+        self._repeated = False  # whether the take-off was repeated for as long as allowed
+        self._last_refusal = ("", -_REFUSE_AGAIN_S)  # last refusal of a stick command: reason and time [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
             Take: lambda command: self._run_in_turn(command, self._take),
             Release: lambda command: self._run_in_turn(command, self._release),
@@ -162,7 +162,7 @@ class ControlSession:
 
     @property
     def waits(self) -> bool:
-        """Whether the page waits for the authority: queued, or to get it back."""
+        """Whether the page waits for the authority, either in the queue or to get it back."""
         return self._pilot is not None and self._pilot.authority.state in ("queued", "preempted")
 
     async def run(self) -> None:
@@ -184,7 +184,7 @@ class ControlSession:
     # Messages of the page --------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
-        """Carry out the page's commands; of stick commands that queued up, only the newest."""
+        """Carry out the page's commands. Of the stick commands that have queued up, use only the newest."""
         commands: list[AnyCommand] = []
         for text in texts:
             try:
@@ -199,42 +199,42 @@ class ControlSession:
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
         if not problem and not _is_deaf(command, now_ns):
-            self._restart_silence_timer()  # an old message is no sign of life
+            self._restart_silence_timer()  # an old message is not a sign of life
         if isinstance(command, Alive):
             self._on_ping(command, now_ns)
             return
         try:
-            if problem and not (isinstance(command, HoverHere) and command.automatic):  # the page sends it only once
+            if problem and not (isinstance(command, HoverHere) and command.automatic):  # the page sends this only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
-                # A stop uses its own connection, so no refusal here belongs to it.
+                # A stop has its own connection, so refusals seen here never belong to it.
                 self._decided = self._decided if isinstance(command, Stop) else (command.do, command.n)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
 
     def _on_ping(self, ping: Alive, now_ns: int) -> None:
-        """Mark the page as present since it last received from the cockpit, and answer."""
+        """Mark the page as present since it last received data from the cockpit, and answer."""
         if ping.seen_s is not None and self._pilot is not None:
-            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # never in the future, whatever the page sends
+            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # never in the future, whatever it claims
             self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
         self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
 
     def _send_command(
         self, command: AnyCommand, act: Callable[[PilotConnection], bool], until: frozenset[FlightState] = frozenset()
     ) -> None:
-        """Send one command, which ends the page's previous flight.
+        """Send one command, ending the page's previous flight.
 
-        It is done once sent or, if ``until`` names states, once the vehicle is in one of them.
+        The command is complete once it is sent or, if ``until`` names states, once the vehicle is in one of them.
 
         Args:
             command: The page's command.
-            act: Sends it; returns whether it was sent.
+            act: Sends the command; returns whether it was sent.
             until: The states that complete the command.
 
         Raises:
-            SkyloopError: Any error of the drone; :class:`LinkError` if it was not sent.
+            SkyloopError: Any error from the drone; :class:`LinkError` if the command was not sent.
         """
         pilot = self._held()
         self._send_now(pilot, act, command)
@@ -245,23 +245,23 @@ class ControlSession:
             self._done(command.do, command.n)
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
-        """End the page's previous flight and send a command; :class:`LinkError` if it was not sent."""
+        """End the page's previous flight and send a command; raise :class:`LinkError` if it was not sent."""
         with self._in_place_of(pilot, f"{command.do} was commanded"):
             sent = act(pilot)
         if not sent:
             with suppress(SkyloopError):
-                pilot.idle()  # or it would still be carried out if the link came back soon
+                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
 
     @contextmanager
     def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
-        """End the page's previous flight, and hover if its replacement is refused."""
+        """End the page's previous flight; hover if what replaces it is refused."""
         self._end_flight(why)
         with _else_hovering(pilot, "its replacement was refused"):
             yield
 
     def _hover_here(self, command: HoverHere) -> None:
-        """Hover because the person decided to, or because the page reports that nothing is held."""
+        """Hover because the person decided so, or because the page reports that no key or stick is held."""
         if command.automatic:
             self._held()
             self.let_go("nothing is held on the page")
@@ -282,7 +282,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     def _set_out(self, command: AnyCommand, plan: Callable[[PilotConnection], Leg]) -> None:
-        """Command a flight to a place, and watch it until it is over."""
+        """Command a flight to a place and monitor it until it is over."""
         pilot = self._held()
         leg = plan(pilot)
         self._send_now(pilot, lambda pilot: pilot.command(leg.action), command)
@@ -291,7 +291,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     async def _fly_route(self, command: FlyRoute, held: Callable[[], PilotConnection]) -> None:
-        """Check a route again, as much may have changed, and fly it."""
+        """Check a route again, because much may have changed, and fly it."""
         route = self._station.routes.get(command.id)
         held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
@@ -322,7 +322,7 @@ class ControlSession:
         self._acknowledge(command)
 
     async def _follow_target(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track the content of a box; without a mode this needs no authority."""
+        """Track the content of a box. Without a mode, this needs no authority."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
@@ -337,21 +337,21 @@ class ControlSession:
         self._acknowledge(command)
 
     def _aim(self, goal: Waypoint | None) -> None:
-        """Show the goal that a route flies to."""
+        """Show the goal that a route is flying to."""
         if goal is None:
             self._station.goals.pop(self.app, None)
         else:
             self._station.goals[self.app] = goal
 
     def _end_route(self) -> None:
-        """End the route for good: its connection ends, or another route or flight replaces it."""
+        """End the route permanently: its connection ends, or another route or flight replaces it."""
         if self._route is not None:
             self._route.end(hover=False)
             self._route = None
 
     async def _stop_motors(self, command: Stop) -> None:
-        """Stop the motors, retrying for as long as the page shows the command as pending."""
-        assert command.at_s is not None  # or it would be untimely
+        """Stop the motors, retrying as long as the page shows the command as pending."""
+        assert command.at_s is not None  # otherwise it would be untimely
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
         try:
             await self._station.stop_motors(until_ns, lambda: self._acknowledge(command))
@@ -391,7 +391,7 @@ class ControlSession:
         pilot = self._held()
         self._acknowledge(command)
         if command.grant:
-            self._authority.handed_over()  # observers may see this before the proxy confirms the answer
+            self._authority.handed_over()  # observers may see this before the proxy has confirmed the answer
         try:
             await self._takeover.answer(command, pilot)
         except RefusedError:
@@ -408,7 +408,7 @@ class ControlSession:
         self._update()
 
     async def _close_pilot(self) -> None:
-        """Close the page's own connection, which it does not need without the authority."""
+        """Close the page's own connection, which is not needed without the authority."""
         self._end_route()
         pilot, self._pilot = self._pilot, None
         if pilot is not None:
@@ -430,7 +430,7 @@ class ControlSession:
         """Return the connection that holds the authority.
 
         Raises:
-            AuthorityError: No connection holds it.
+            AuthorityError: The page does not hold the authority.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
@@ -441,10 +441,10 @@ class ControlSession:
         return pilot
 
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
-        """Return a check that replaces :meth:`_held` in a job that waits for answers.
+        """Return a check to use in place of :meth:`_held` in a job that waits for answers.
 
-        It raises :class:`RefusedError` if any other command has flown or ended a flight since (the newest decision
-        counts), or if the command has become too old.
+        The check raises :class:`RefusedError` if another command has flown or ended a flight in the meantime (the
+        newest decision wins), or if the command has become too old.
         """
         number = self._decisions
 
@@ -481,9 +481,9 @@ class ControlSession:
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
     def _end_flight(self, why: str = "something else was commanded, or the page was silent") -> None:
-        """End the page's previous flight; a route is paused and can be resumed."""
+        """End the page's previous flight. A route is only paused and can be resumed."""
         self._decisions += 1
-        if self._decided != self._last_command:  # earlier intents, and their refusals, belong to the previous command
+        if self._decided != self._last_command:  # earlier intents and their refusals belong to the previous command
             self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
         self._steering = self._stood_down = False
         self._follow.interrupt(why)
@@ -493,7 +493,7 @@ class ControlSession:
         self._place.cancel()
 
     def let_go(self, why: str) -> None:
-        """Hover if this page has the vehicle under way; a take-off or landing completes safely without the page."""
+        """Hover if this page has the vehicle under way. A take-off or landing completes safely without the page."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         pilot = self._pilot
@@ -501,7 +501,7 @@ class ControlSession:
             pilot.let_go(why)
 
     def stand_down(self, why: str) -> None:
-        """Send no more commands, as the motors are being stopped; the authority is kept."""
+        """Send no more commands, because the motors are being stopped. The authority is kept."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         self._stood_down = flies
@@ -512,7 +512,7 @@ class ControlSession:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _on_page_gone(self) -> None:
-        """Hover at once after the page has disconnected."""
+        """Hover at once, because the page has disconnected."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
@@ -522,14 +522,14 @@ class ControlSession:
         """Wait for running jobs and release the authority."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         await self._follow.close()
-        self.let_go("the page is gone")  # control may have been taken, or a flight begun, only now
+        self.let_go("the page is gone")  # control may only now have been taken, or a flight begun
         await self._close_pilot()
         await self._station.pilot_went()
 
     # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Send changes of the authority and of the page's open questions, and report completed commands."""
+        """Send changes of the authority and of open questions to the page, and report completed commands."""
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
@@ -544,7 +544,7 @@ class ControlSession:
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
                     with suppress(SkyloopError):
-                        pilot.idle()  # it continues if begun; if not, it must not begin once a slow link is back
+                        pilot.idle()  # one already begun continues; others must not begin when a slow link recovers
             with suppress(LinkError):
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
@@ -552,12 +552,12 @@ class ControlSession:
                     self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
-        """Handle requests for a takeover."""
+        """Handle requests to take over."""
         if self._pilot is not None:
             self._takeover.on_event(event, self._pilot)
 
     def _observe_refusal(self, pilot: PilotConnection) -> None:
-        """End this page's flight and inform the page if the proxy has refused or ended it."""
+        """If the proxy has refused or ended this page's flight, end it here and inform the page."""
         outcome = pilot.refusal(self._first)
         if outcome is None:
             return
@@ -567,10 +567,10 @@ class ControlSession:
         if not watched and (refused or self._awaited or self._is_under_way):
             self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows whose
         if watched or self._place.is_under_way:
-            self.let_go(outcome.text)  # the same feedback shows whether others have the vehicle
+            self.let_go(outcome.text)  # this feedback also shows whether others have taken the vehicle
         elif self._last_command[0] == TakeOff().do:
             with suppress(SkyloopError):
-                pilot.idle()  # or it would take off by surprise as soon as it can
+                pilot.idle()  # otherwise it would take off unexpectedly as soon as it can
         self._awaited = None
 
     def _refuse(self, do: str, n: int, why: str) -> None:
@@ -580,7 +580,7 @@ class ControlSession:
         self._send({"type": "done", "do": do} | ({"n": n} if n else {}))
 
     def _refuse_command(self, command: AnyCommand, why: str) -> None:
-        if isinstance(command, Fly):  # arrives 20 times a second
+        if isinstance(command, Fly):  # these arrive 20 times a second
             now_s = seconds(self._clock())
             before, at_s = self._last_refusal
             if why == before and now_s - at_s <= _REFUSE_AGAIN_S:
@@ -592,7 +592,7 @@ class ControlSession:
         self._send({"type": "sent", "do": command.do, "n": command.n})
 
     def _run_in_turn(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
-        """Start a job that may block, after those started before it."""
+        """Start a job that may block, after the jobs started earlier have ended."""
         self._start_job(self._run(command, work))
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
@@ -613,7 +613,7 @@ class ControlSession:
 
 @contextmanager
 def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
-    """Hover if the command in this block is refused, because the previous flight is no longer watched."""
+    """Hover if the command in this block is refused, because the previous flight is no longer monitored."""
     try:
         yield
     except SkyloopError:
@@ -622,7 +622,7 @@ def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
 
 
 def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
-    """Return whether a ping shows that its page receives nothing: it hovers before it counts as gone."""
+    """Return whether a ping shows that its page receives nothing; such a page hovers before it counts as gone."""
     if not isinstance(command, Alive) or command.seen_s is None:
         return False
     return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S

@@ -1,4 +1,4 @@
-"""Discovery: find the proxies of this host and of the network, without any of them noticing."""
+"""Find the proxies on this host and on the network, without any of them noticing."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 class Found(NamedTuple):
-    """A proxy that is available for connection."""
+    """A proxy that can be connected to."""
 
     name: str
-    transport: str  #: as shown to people, such as ``local``
+    transport: str  #: transport as shown to users, such as ``local``
     dial: Dialer
 
 
@@ -28,11 +28,11 @@ class Finder(Protocol):
     """Searches for proxies repeatedly, on threads other than the event loop's."""
 
     def __call__(self) -> list[Found]:
-        """Return the proxies available now.
+        """Return the proxies that can be connected to now.
 
         Raises:
-            SkyloopError: The search is impossible now.
-            OSError: The same.
+            SkyloopError: Searching is currently not possible.
+            OSError: Searching is currently not possible.
         """
 
     def add_name(self, name: str) -> None:
@@ -43,13 +43,13 @@ class Finder(Protocol):
 
 
 class LocalFinder:
-    """Finds the proxies of this host that this user can reach."""
+    """Finds the proxies on this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
         """Prepare the search.
 
         Args:
-            names: Search for these only; empty: all.
+            names: Search only for these; empty: all.
         """
         self._names = frozenset(names)
         self._also: set[str] = set()
@@ -59,10 +59,10 @@ class LocalFinder:
         self._also.add(name)
 
     def close(self) -> None:
-        """Do nothing, as nothing was opened."""
+        """Do nothing, because nothing was opened."""
 
     def __call__(self) -> list[Found]:
-        if sys.platform != "linux":  # proxies run on Linux only
+        if sys.platform != "linux":  # proxies run only on Linux
             return []
         from skyloop.transport.base import NAME
         from skyloop.transport.local import dial
@@ -85,9 +85,9 @@ class LocalFinder:
 
 
 class NetworkFinder:
-    """Finds the proxies of this host, and those of the network with other names. Any thread.
+    """Finds the proxies on this host, and those on the network that have other names. Any thread.
 
-    The first search opens a session and keeps it, so later searches are cheap.
+    The first search opens a session and keeps it, so that later searches are cheap.
     """
 
     def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
@@ -96,12 +96,12 @@ class NetworkFinder:
         Args:
             local: Finds the proxies of this host.
             settings: How to join the network.
-            wanted: Search for these names only; empty: all.
+            wanted: Search only for these names; empty: all.
         """
         self._local = local
         self._settings = settings
         self._wanted = wanted
-        self._lock = threading.Lock()  # guards the fields below: several threads may search
+        self._lock = threading.Lock()  # guards the following fields: several threads may search
         self._session: Session | None = None
         self._known: dict[str, Found] = {}
 
@@ -134,7 +134,7 @@ class NetworkFinder:
         with self._lock:
             current = self._settings.current()
             if self._session is not None and current is not self._settings:
-                release(self._session)  # the roster has changed: revoked members must no longer be found
+                release(self._session)  # the roster has changed, and revoked members must no longer be found
                 self._session = None
             self._settings = current
             if self._session is None:

@@ -1,7 +1,7 @@
-"""A camera's frames for all pages that show them: each encoded to JPEG once, and H.264 relayed unchanged.
+"""One camera's frames for all pages that show them: encoded to JPEG once for all pages; H.264 is relayed unchanged.
 
-The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. An H.264 picture depends on the
-one before, so a page receives all of them in order or resumes at a key picture. Nothing is encoded to H.264 here.
+The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. H.264 pictures depend on the
+previous ones, so a page receives all of them in order or resumes at a key picture. Nothing is encoded to H.264 here.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ JPEG_QUALITY = 80
 
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
-NICENESS: Final = 10  #: of the encoding thread
+NICENESS: Final = 10  #: niceness of the encoding thread
 
 
 def _give_way() -> None:
-    if sys.platform == "linux":  # elsewhere only whole processes have a priority
+    if sys.platform == "linux":  # elsewhere, only whole processes have a priority
         os.nice(NICENESS)
 
 
-#: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps its
-#: original priority: a person's sticks and stop pass through it, and must not starve beside a browser.
+#: One thread for all cameras, because encoding for many pages must not take cores from flying. The event loop keeps its
+#: original priority: a person's sticks and stop pass through it, and a browser must not starve it.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
-KEPT: Final = 16  #: newest pictures of a form; a page further behind resumes at a key picture
-SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes; few steps, so that similar panes share a form
-RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s]; likewise
-BITS: Final = 0.12  #: per pixel of a moving picture
-_FPS: Final = 30.0  # of a camera that reports no rate
+KEPT: Final = 16  #: newest pictures kept per form; a page further behind resumes at a key picture
+SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: scales of pictures in panes; few, so that similar panes share a form
+RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s]; few as well
+BITS: Final = 0.12  #: bits per pixel of a moving picture
+_FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
 
 P = TypeVar("P")
@@ -56,9 +56,9 @@ P = TypeVar("P")
 
 @dataclass(frozen=True, slots=True)
 class Numbered(Generic[P]):
-    """A picture for pages, numbered within this process, across restarts of the proxy.
+    """A picture for pages, with a number that is unique in this process, even if the proxy restarts.
 
-    For H.264 the number grows by one only if the picture continues the previous one.
+    For H.264, the number increases by exactly one only if the picture continues the previous one.
     """
 
     serial: int
@@ -77,10 +77,10 @@ class CameraFeed:
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
         self.newest: Numbered[Frame] | None = None
-        self.encoded = 0  #: frames encoded to JPEG
+        self.encoded = 0  #: number of frames encoded to JPEG
         self._drone = drone
         self._clock = clock
-        self._since_ns = 0  # time of the first page's subscription
+        self._since_ns = 0  # when the first page subscribed
         self._listener: Cancellable | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
@@ -88,11 +88,11 @@ class CameraFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows it."""
+        """Whether a page shows the camera."""
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame; the first subscriber subscribes to the camera."""
+        """Call ``wake`` on the loop for each newer frame. The first subscriber subscribes to the camera."""
         self._wakes.add(wake)
         if self._listener is None:
             loop = asyncio.get_running_loop()
@@ -102,7 +102,7 @@ class CameraFeed:
             wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``; the last subscriber unsubscribes from the camera."""
+        """Stop calling ``wake``. The last subscriber unsubscribes from the camera."""
         self._wakes.discard(wake)
         if not self._wakes and self._listener is not None:
             self._listener.cancel()
@@ -112,7 +112,7 @@ class CameraFeed:
     def age_s(self) -> float | None:
         """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page shows the camera and before the first frame ever: a vehicle may take seconds to send it.
+        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
         """
         if self._listener is None or not self._serial:
             return None
@@ -133,7 +133,7 @@ class CameraFeed:
             self._listener = None
 
     def _put(self, frame: Frame) -> None:
-        if self._listener is None:  # cancelled while this call was on its way
+        if self._listener is None:  # cancelled before this call arrived
             return
         self._serial += 1
         self.newest = Numbered(self._serial, frame)
@@ -149,7 +149,7 @@ def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
         quality: 1 to 100.
 
     Raises:
-        ValueError: OpenCV failed to encode it.
+        ValueError: OpenCV could not encode the frame.
     """
     import cv2
 
@@ -160,14 +160,14 @@ def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
 
 
 def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
-    """Return a binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG files."""
+    """Return a binary message: length of the head (4 bytes, big-endian), the head in JSON, the JPEG files."""
     text = _encode(head)
     return b"".join((_LENGTH.pack(len(text)), text, *jpegs))
 
 
-FPS: Final = 12.0  #: at most, of each camera
-WIDTHS: Final = (160, 240, 320, 480)  #: of frames [pixels]; a page's request is rounded up to one of them
-QUALITY: Final = 70  #: of the JPEG files
+FPS: Final = 12.0  #: maximum frame rate of each camera
+WIDTHS: Final = (160, 240, 320, 480)  #: widths of frames [pixels]; a page's request is rounded up to one of them
+QUALITY: Final = 70  #: quality of the JPEG files
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,25 +177,25 @@ class SmallFrame:
     serial: int
     jpeg: bytes
     seq: int
-    captured_ns: int  #: on the proxy's clock
+    captured_ns: int  #: capture time on the proxy's clock
     width: int
     height: int
 
 
 class SmallFeed:
-    """The newest frame of one camera in one size, as a JPEG file, while a page shows it. Used on the event loop.
+    """One camera's newest frame in one size, as a JPEG file, while a page shows it. Used on the event loop.
 
     Args:
         drone: The drone.
         camera: The camera.
-        width: The width to scale down to [pixels]; a smaller frame stays as it is.
+        width: The width to scale down to [pixels]; smaller frames are left unchanged.
         clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, camera: CameraInfo, width: int, clock: Clock = monotonic_ns) -> None:
         self.camera = camera.name
-        self.newest: SmallFrame | None = None  #: replaced as a whole, by the drone's receiving thread
-        self.encoded = 0  #: frames encoded to JPEG
+        self.newest: SmallFrame | None = None  #: replaced as a whole by the drone's receiving thread
+        self.encoded = 0  #: number of frames encoded to JPEG
         self._drone = drone
         self._scale = min(1.0, width / camera.width) if camera.width > 0 else 1.0
         self._clock = clock
@@ -205,14 +205,14 @@ class SmallFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows it."""
+        """Whether a page shows the camera."""
         return self._pages > 0
 
     @property
     def age_s(self) -> float | None:
         """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page shows the camera and before the first frame ever: a vehicle may take seconds to send it.
+        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
         """
         if not self.wanted or not self.encoded:
             return None
@@ -222,21 +222,21 @@ class SmallFeed:
         return seconds(now_ns + self._drone.clock_offset_ns - newest.captured_ns)
 
     def subscribe(self) -> None:
-        """Add a page that shows it; the first subscribes to the camera.
+        """Add a page that shows the camera; the first one subscribes to the camera.
 
         Raises:
             SkyloopError: The drone was closed, or no longer has this camera.
         """
         if self._listener is None:
             self._since_ns = self._clock()
-            # Inline: a thread for each camera would be woken for each frame, and do no more than this.
+            # Inline, because a thread per camera would be woken for each frame and do no more than this.
             self._listener = self._drone.on_frame(
                 self._put, camera=self.camera, inline=True, encoding="jpeg", max_fps=FPS, scale=self._scale
             )
         self._pages += 1
 
     def unsubscribe(self) -> None:
-        """Remove a page that shows it; the last unsubscribes from the camera."""
+        """Remove a page that showed the camera; the last one unsubscribes from the camera."""
         self._pages -= 1
         if self._pages == 0:
             self.close()
@@ -248,7 +248,7 @@ class SmallFeed:
             self._listener = self.newest = None
 
     def _put(self, frame: Frame) -> None:
-        """Encode a frame and keep it, on the drone's receiving thread."""
+        """Encode a frame and keep it. Runs on the drone's receiving thread."""
         jpeg = to_jpeg(frame, QUALITY)
         self.encoded += 1
         height, width = frame.shape[:2]
@@ -256,16 +256,16 @@ class SmallFeed:
 
 
 def rounded_width(wish: int) -> int:
-    """Return the smallest of :data:`WIDTHS` that is at least ``wish`` [pixels]; the largest if none is."""
+    """Return the smallest of :data:`WIDTHS` that is at least ``wish`` [pixels], or the largest if none is."""
     return next((width for width in WIDTHS if width >= wish), WIDTHS[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a camera's pictures are encoded. With neither rate nor subscriber: as the vehicle encodes them.
+    """How a camera's pictures are encoded. Without rate and subscriber, they are as the vehicle encodes them.
 
-    ``kbit_s``: at this rate, once for all subscribers of the same form. ``subscriber``: for this one alone, at the rate
-    and size that its path carries.
+    ``kbit_s``: encoded at this rate, once for all subscribers of the same form. ``subscriber``: encoded for this
+    subscriber alone, at the rate and size that its path can carry.
     """
 
     kbit_s: int | None = None
@@ -275,19 +275,19 @@ class Form:
 
     @property
     def kind(self) -> str:
-        """The form's owner: ``vehicle``, ``shared`` or ``own``."""
+        """Who the form is for: ``vehicle``, ``shared`` or ``own``."""
         if self.subscriber:
             return "own"
         return "vehicle" if self.kbit_s is None else "shared"
 
 
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
-    """Choose the form shared by all panes of about the same size.
+    """Choose the form that all panes of about the same size share.
 
     Args:
         camera: The camera.
-        width: Of the pane [device pixels]; 0: full size.
-        max_fps: Most pictures a second; None: all.
+        width: Width of the pane [device pixels]; 0: full size.
+        max_fps: Maximum number of pictures per second; None: all.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -301,16 +301,16 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
 
 
 class EncodedFeed:
-    """The newest pictures of one form, while a page shows them. Created and used on the event loop.
+    """The newest pictures in one form, while a page shows them. Created and used on the event loop.
 
     Args:
         drone: The drone.
         camera: The camera's name.
-        form: How it is encoded.
+        form: How the pictures are encoded.
         clock: The monotonic clock [ns].
     """
 
-    encoded = 0  #: frames encoded here: none
+    encoded = 0  #: number of frames encoded here: none
 
     def __init__(self, drone: Drone, camera: str, form: Form, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
@@ -318,25 +318,25 @@ class EncodedFeed:
         self._counter = ChannelCounter()
         self._drone = drone
         self._clock = clock
-        self._came_ns = 0  # arrival time of the newest picture
+        self._came_ns = 0  # when the newest picture arrived
         self._channel: StreamChannel | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serial = 0
-        self._lock = threading.Lock()  # guards the fields below
+        self._lock = threading.Lock()  # guards the following fields
         self._wakes: dict[object, Wake | None] = {}  # by page
         self._pictures: deque[Numbered[EncodedFrame]] = deque(maxlen=KEPT)
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows it."""
+        """Whether a page shows these pictures."""
         return bool(self._wakes)
 
     @property
     def age_s(self) -> float | None:
         """Age of the newest picture [s].
 
-        None while no page shows it, before the first picture, and while it waits for the one page it serves, which says
-        nothing about the camera.
+        None while no page shows the camera, before the first picture, and while waiting for the one page that the form
+        is for, which says nothing about the camera.
         """
         with self._lock:
             newest = self._pictures[-1] if self._pictures else None
@@ -346,21 +346,21 @@ class EncodedFeed:
 
     @property
     def silent_s(self) -> float:
-        """Time without a picture [s]; 0 if that may be because the one page it serves accepts none."""
+        """Time without a picture [s]; 0 if the reason may be that the one page it is for accepts none."""
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
 
     def stats(self) -> ChannelStats:
-        """Return the statistics of the stream, as for a channel of the drone."""
+        """Return the stream's statistics, in the form of a channel's."""
         return self._counter.stats(self._clock())
 
     def subscribe(self, page: object, wake: Wake | None) -> None:
-        """Add a page that shows it; the first subscribes to the stream, which begins with a key picture.
+        """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key picture.
 
         Args:
             page: Identifies the page.
-            wake: Called on the event loop for each picture; None: the page polls.
+            wake: Called on the event loop for each picture; None if the page polls.
 
         Raises:
             SkyloopError: The drone was closed, or no longer has this camera.
@@ -383,7 +383,7 @@ class EncodedFeed:
             self._wakes[page] = wake
 
     def unsubscribe(self, page: object) -> None:
-        """Remove a page that shows it; the last unsubscribes from the stream."""
+        """Remove a page that showed the pictures; the last one unsubscribes from the stream."""
         with self._lock:
             self._wakes.pop(page, None)
         if not self.wanted:
@@ -398,11 +398,11 @@ class EncodedFeed:
                 self._pictures.clear()
 
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
-        """Return the next pictures for a page, in order, and the number that it misses before them.
+        """Return the next pictures for a page, in order, and how many it misses before them.
 
         Args:
-            serial: The last picture sent to it; 0: none yet.
-            follows: Whether it can decode the picture after that; if not, it resumes at a key picture.
+            serial: Number of the last picture sent to the page; 0: none yet.
+            follows: Whether the page can decode the next picture; if not, it resumes at a key picture.
         """
         with self._lock:
             newer = [one for one in self._pictures if one.serial > serial]
@@ -420,17 +420,17 @@ class EncodedFeed:
         return chosen, chosen[0].serial - serial - 1 if serial else 0
 
     def ask_for_key(self) -> None:
-        """Request a key picture from the proxy, at most a few times a second."""
+        """Request a key picture from the proxy, but only a few times a second."""
         if self._channel is not None:
             self._channel.report(0, wants_key=True)
 
     def acknowledge(self, seq: int) -> None:
-        """Report the pictures that the page has to the proxy, if the rate depends on that."""
+        """Report to the proxy which pictures the page has, if the rate depends on that."""
         if self._channel is not None and self.form.subscriber:
             self._channel.report(seq)
 
     def _put(self, picture: EncodedFrame) -> None:
-        """Keep a picture, on the drone's receiving thread."""
+        """Keep a picture. Runs on the drone's receiving thread."""
         with self._lock:
             last = self._pictures[-1].picture.seq if self._pictures else 0
             self._serial += 1 if picture.seq == last + 1 else 2

@@ -1,7 +1,7 @@
-"""From the client's threads to the event loop, and to pages at a steady rate: everything but frames.
+"""Pass data other than frames from the client's threads to the event loop, and to pages at a steady rate.
 
-That is the newest drawing of each source, the last events, applications' logs, and the commands applied. All of it
-runs on the event loop, except for the callbacks registered with the drone.
+This includes the newest drawing from each source, the latest events, applications' logs, and the commands applied.
+Everything runs on the event loop, except for the callbacks registered with the drone.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from skyloop.messages.relayed import MOCAP as SERIES
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-ROW_HZ: Final = 2.0  #: of a drone's feedback while pages show it only as a row of the overview
+ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
 KEPT_EVENTS = 256
 KEPT_S = 10.0  #: older drawings and logs are no longer shown
-MAX_SERIES = 256  #: logged numbers shown of one drone
-MAX_SOURCES = 64  #: sources of drawings shown of one drone, over all its cameras
-MAX_WAYPOINTS = 256  #: shown of one path
+MAX_SERIES = 256  #: maximum number of logged series shown per drone
+MAX_SOURCES = 64  #: maximum number of sources of drawings shown per drone, over all its cameras
+MAX_WAYPOINTS = 256  #: maximum number of waypoints shown per path
 WAYPOINTS = "waypoints"  #: name under which a controller logs its goals
-MOCAP_S = 0.5  #: older poses of motion capture are not shown
+MOCAP_S = 0.5  #: older motion capture poses are not shown
 
 _KEPT_NS = round(KEPT_S * 1e9)
 
@@ -46,24 +46,24 @@ class Cancellable(Protocol):
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread; does nothing if the loop is closed, as it has no pages left."""
+    """Call a function on the loop, from any thread. Do nothing if the loop is closed, because no pages are left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
 
 
 class PeriodicBroadcast:
-    """Makes a message at a steady rate while there are subscribers, once for all of them. On the event loop."""
+    """Creates a message at a steady rate, once for all subscribers, while there are any. On the event loop."""
 
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
-        """Prepare it; the first subscriber starts it.
+        """Initialise without starting; the first subscriber starts it.
 
         Args:
-            period_s: Between two messages [s].
-            make: Makes a message.
-            on_change: Called with True before the first subscriber, with False after the last one.
+            period_s: Time between two messages [s].
+            make: Creates a message.
+            on_change: Called with True before the first subscriber is added, and with False after the last has left.
         """
-        self.message = b""  #: the newest
-        self.closed = False  #: no more messages will come
+        self.message = b""  #: the newest message
+        self.closed = False  #: whether no more messages will be created
         self._period_s = period_s
         self._make = make
         self._on_change = on_change
@@ -76,7 +76,7 @@ class PeriodicBroadcast:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and now with a fresh one, unless the broadcast is closed."""
+        """Call ``wake`` for each new message, and immediately for a fresh one, unless the broadcast is closed."""
         if self.closed:
             wake()
             return
@@ -88,7 +88,7 @@ class PeriodicBroadcast:
         wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``; does nothing if it is not subscribed."""
+        """Stop calling ``wake``; do nothing if it is not subscribed."""
         if wake in self._wakes:
             self._wakes.discard(wake)
             if not self._wakes:
@@ -96,7 +96,7 @@ class PeriodicBroadcast:
                 self._on_change(False)
 
     def close(self) -> None:
-        """End the broadcast for good, and wake all subscribers."""
+        """End the broadcast permanently and wake all subscribers."""
         self.closed = True
         self._stop()
         for wake in list(self._wakes):
@@ -111,7 +111,7 @@ class PeriodicBroadcast:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            due = max(due + self._period_s, loop.time())  # missed periods are not made up for
+            due = max(due + self._period_s, loop.time())  # skip missed periods
             await asyncio.sleep(due - loop.time())
             self.message = self._make()
             for wake in list(self._wakes):
@@ -119,20 +119,20 @@ class PeriodicBroadcast:
 
 
 class Newest(Generic[K, V]):
-    """The newest value of each of at most ``most`` keys, forgotten after :data:`KEPT_S`.
+    """The newest value for each of at most ``most`` keys, forgotten after :data:`KEPT_S`.
 
-    A key keeps its place while its value is renewed, however many others compete for one. One thread calls :meth:`put`,
-    others read.
+    A key keeps its place as long as its value is updated, however many others compete for one. One thread calls
+    :meth:`put`, others read.
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: values refused for lack of a place
+        self.refused = 0  #: number of values refused for lack of a place
         self._most = most
         self._clock = clock
-        self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the last renewed comes last
+        self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the most recently updated comes last
 
     def put(self, key: K, value: V) -> None:
-        """Set a key's value; a new key without a free place is refused and counted."""
+        """Set a key's value. If there is no place for a new key, refuse and count it."""
         now_ns = self._clock()
         if self._values.pop(key, None) is None and len(self._values) >= self._most:
             oldest = next(iter(self._values))
@@ -153,7 +153,7 @@ class Newest(Generic[K, V]):
 
 
 class Drawing:
-    """A drawing for pages; encoded once for all of them."""
+    """A drawing for pages, encoded once for all of them."""
 
     __slots__ = ("_text", "annotation")
 
@@ -163,18 +163,18 @@ class Drawing:
 
     @property
     def text(self) -> str:
-        """The JSON message for pages."""
+        """The JSON message sent to pages."""
         if self._text is None:
             self._text = _encode(drawing_values(self.annotation)).decode()
         return self._text
 
 
 def drawing_values(annotation: Annotation) -> dict[str, Any]:
-    """Return an annotation as JSON values for a page."""
+    """Return an annotation as JSON values for pages."""
     return {
         "type": "drawing",
         "source": annotation.source,
-        "captured_ns": str(annotation.captured_ns),  # too large for JavaScript's numbers
+        "captured_ns": str(annotation.captured_ns),  # too large for numbers in JavaScript
         "width": annotation.width,
         "height": annotation.height,
         "shapes": [_shape(shape) for shape in annotation.shapes],
@@ -192,7 +192,7 @@ def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
 class EventFeed:
     """The drone's annotations and events.
 
-    Events are numbered here, because events made by the client have no number.
+    Events are numbered here, because events created by the client have no number.
 
     Args:
         drone: The drone.
@@ -205,14 +205,14 @@ class EventFeed:
         self._next = len(self.events) + 1
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
-        self._waking = False  # a wake-up of the pages is scheduled
+        self._waking = False  # a wake-up of the pages has been scheduled
         self._listeners: list[Cancellable] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop when there is a newer drawing."""
+        """Call ``wake`` on the loop when a newer drawing exists."""
         self._wakes.add(wake)
 
     def unsubscribe(self, wake: Wake) -> None:
@@ -220,7 +220,7 @@ class EventFeed:
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return the events with higher numbers, and those numbers, the oldest first."""
+        """Return the events with higher numbers, together with these numbers, oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
@@ -229,7 +229,7 @@ class EventFeed:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        """Keep a drawing. On the client's thread; any number of drawings schedules one call on the loop."""
+        """Keep a drawing. Runs on the client's thread; any number of drawings schedules one call on the loop."""
         self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
         if not self._waking:
             self._waking = True
@@ -246,10 +246,9 @@ class EventFeed:
 
 
 class LogFeed:
-    """The logs of applications, and the command applied last.
+    """The logs of applications, and the command last applied.
 
-    Subscribed only on demand, because it costs the proxy something. The client's receiving thread replaces the values
-    as a whole.
+    Subscribed to only on demand, to save the proxy work. The client's receiving thread replaces the values as a whole.
 
     Args:
         drone: The drone.
@@ -266,7 +265,7 @@ class LogFeed:
         self._listeners: list[Cancellable] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe, or unsubscribe and forget the values."""
+        """Subscribe; or unsubscribe and forget the values."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -280,16 +279,16 @@ class LogFeed:
             self._waypoints, self._mocap, self.applied = None, None, None
 
     def numbers(self) -> dict[str, float]:
-        """Return the newest value of each series logged within :data:`KEPT_S`."""
+        """Return the newest value in each series logged within :data:`KEPT_S`."""
         return dict(self._numbers.items())
 
     @property
     def refused(self) -> int:
-        """Logged numbers refused for lack of a place."""
+        """Number of logged values refused for lack of a place."""
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the array ``waypoints`` logged last, if within :data:`KEPT_S`.
+        """Return the array ``waypoints`` that was logged last, if within :data:`KEPT_S`.
 
         Returns:
             Rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
@@ -301,7 +300,7 @@ class LogFeed:
         """Return the newest pose from motion capture.
 
         Returns:
-            x, y, z [m], quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
+            x, y, z [m] and quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
         """
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None

@@ -1,9 +1,9 @@
-"""All drones known to the cockpit: found, observed, shown as lost, forgotten; and commands to all of them.
+"""All drones known to the cockpit: finding, observing and forgetting them, showing lost ones; commands to all of them.
 
-Each drone has one connection for all pages. If a drone vanishes, its connection searches for it and brings it back;
-it is removed only if it was gone for long and no page shows it. All of this runs on the event loop, except for
-connecting and closing, which may block and run on threads. A page's commands to all drones, land all and stop all,
-need no open or selected drone.
+All pages share one connection to each drone. If a drone disappears, its connection searches for it and restores it; the
+drone is removed only after a long absence and if no page shows it. All of this runs on the event loop, except for
+connecting and closing, which may block and therefore run on threads. A page's commands to all drones, land all and stop
+all, work without any drone being open or selected.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
 
 LOOK_S: Final = 0.5
-FORGET_S: Final = 60.0  #: after this time a lost drone is no longer shown
+FORGET_S: Final = 60.0  #: a drone lost for longer than this is no longer shown
 CONNECT_S: Final = 3.0
-OVERVIEW_S: Final = 0.5  #: period of the overview sent to pages
-FIRST_SEARCH_S: Final = 2.0  #: how long the first pages wait for drones that answer slowly
+OVERVIEW_S: Final = 0.5  #: interval between overviews sent to pages
+FIRST_SEARCH_S: Final = 2.0  #: time that the first pages wait for drones that answer slowly
 
 Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
-LANDING_S: Final = 60.0  #: how long a landing is repeated
-BEGIN_S: Final = 2.0  #: a landing without a connection by then is not begun
+LANDING_S: Final = 60.0  #: time for which a landing is repeated
+BEGIN_S: Final = 2.0  #: without a connection by then, a landing is not begun
 _POLL_S: Final = 0.05
 
 Json = dict[str, Any]
@@ -50,7 +50,7 @@ def observe(found: Found) -> Drone:
     """Connect to a proxy as an observer.
 
     Raises:
-        SkyloopError: No connection within :data:`CONNECT_S`.
+        SkyloopError: The connection was not established within :data:`CONNECT_S`.
     """
     from skyloop.client.drone import open_drone
 
@@ -62,10 +62,10 @@ class Fleet:
 
     Args:
         finder: Finds proxies.
-        connect: Connects to one; called on threads.
-        kept: Names that stay listed once they were found.
+        connect: Connects to a proxy; called on threads.
+        kept: Names that stay listed once found.
         clock: The monotonic clock [ns].
-        look_s: Time between two searches [s].
+        look_s: Interval between searches [s].
     """
 
     def __init__(
@@ -79,27 +79,27 @@ class Fleet:
     ) -> None:
         self.finder = finder
         self.stations: dict[str, Station] = {}
-        self.problems: dict[str, str] = {}  #: proxies that were found but not connected, with the reason
+        self.problems: dict[str, str] = {}  #: proxies that were found but could not be connected to, with the reason
         self._connect = connect
         self._kept = frozenset(kept)
         self._clock = clock
         self._search_period_s = look_s
         self._seen_ns: dict[str, int] = {}
-        self._found: dict[str, Found] = {}  # as last found
+        self._found: dict[str, Found] = {}  # as found in the last search
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
         self._begun: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
-        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies found, and keep searching."""
+        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies found, then keep searching."""
         await self.search()
         if self._connecting:
             await asyncio.wait(list(self._connecting.values()), timeout=FIRST_SEARCH_S)
         self._watching = asyncio.create_task(self._watch())
 
     async def close(self) -> None:
-        """Close all connections and wait for that."""
+        """Close all connections and wait until they are closed."""
         waiting = [self._watching, *self._connecting.values()]
         if self._watching is not None:
             self._watching.cancel()
@@ -111,17 +111,17 @@ class Fleet:
         await asyncio.gather(*self._closing, return_exceptions=True)
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Start work that continues after the page that requested it is gone."""
+        """Start work that continues even after the page that requested it is gone."""
         task = asyncio.create_task(work)
         self._begun.add(task)
         task.add_done_callback(self._begun.discard)
 
     async def search(self) -> None:
-        """Search once: begin to connect to new proxies, and remove those gone for good.
+        """Search once: start connecting to new proxies, and remove those that are gone for good.
 
         Raises:
-            SkyloopError: The search is impossible now.
-            OSError: The same.
+            SkyloopError: Searching is currently not possible.
+            OSError: Searching is currently not possible.
         """
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
@@ -143,7 +143,7 @@ class Fleet:
 
     @property
     def unreached(self) -> dict[str, str]:
-        """Drones that were found but can't be commanded for lack of a connection, with the reason, by name."""
+        """Drones that were found but can't be commanded because they are not connected; reasons by name."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
@@ -152,7 +152,7 @@ class Fleet:
         self.finder.add_name(name)
 
     def let_go(self, name: str) -> None:
-        """Remove a drone; if found again, it comes back. Does nothing for an unknown name."""
+        """Remove a drone; if it is found again, it reappears. Do nothing if the name is unknown."""
         if name in self.stations:
             task = asyncio.create_task(self.stations.pop(name).close())
             self._closing.add(task)
@@ -171,12 +171,12 @@ class Fleet:
                 _log.warning("can't search for drones: %s", error)
 
     async def _join(self, found: Found) -> None:
-        # A drone may move to another host under its name: new connections follow it.
+        # A drone may move to another host under the same name, where new connections will find it.
         found = found._replace(dial=lambda handler: self._found[found.name].dial(handler))
         try:
             drone = await asyncio.to_thread(self._connect, found)
         except SkyloopError as error:
-            self.problems[found.name] = str(error)  # retried with the next search
+            self.problems[found.name] = str(error)  # will be retried in the next search
         else:
             self.problems.pop(found.name, None)
             self.stations[found.name] = Station(found, drone)
@@ -185,12 +185,12 @@ class Fleet:
 
 
 class Overview:
-    """All drones in one message, made twice a second for all pages.
+    """All drones in one message, created twice a second for all pages.
 
     Args:
         fleet: The drones.
         recordings: The recordings of the same drones.
-        period_s: Between two messages [s].
+        period_s: Time between two messages [s].
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
@@ -199,7 +199,7 @@ class Overview:
         self.broadcast = PeriodicBroadcast(period_s, self._make, lambda _: None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each drone, by name, including drones that were found and did not answer."""
+        """Return a row for each drone, by name, including drones that were found but did not answer."""
         recorded = self._recordings.drones()
         rows = []
         for name, station in self._fleet.stations.items():
@@ -235,15 +235,15 @@ def _silent(name: str, problem: str) -> dict[str, Any]:
 
 
 class FleetSession:
-    """Serves one socket of a pilot's page; its commands complete even if the page is gone. On the event loop."""
+    """Serves one socket of a pilot's page; its commands complete even if the page goes away. On the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
         """Prepare the session; :meth:`run` serves it.
 
         Args:
-            socket: Already accepted.
+            socket: The socket, already accepted.
             fleet: The drones.
-            person: The name of the person who flies, if known.
+            person: The pilot's name, if known.
             clock: The monotonic clock [ns].
         """
         self._page = PageSocket(socket)
@@ -273,7 +273,7 @@ class FleetSession:
             self._send({"type": "refused", "do": command.do, "n": command.n, "why": problem})
         else:
             stations = [station for _, station in sorted(self._fleet.stations.items()) if station.flies]
-            unreached = self._fleet.unreached  # a person who stops all drones must know which ones were not reached
+            unreached = self._fleet.unreached  # a person who stops all drones must know which ones could not be reached
             names = sorted([*(station.found.name for station in stations), *unreached])
             self._send({"type": "sent", "do": command.do, "n": command.n, "drones": names})
             for name, why in unreached.items():
@@ -293,7 +293,7 @@ class FleetSession:
             self._send({"type": "each", **subject, "state": "refused", "why": str(error)})
 
     async def _stop(self, command: StopAll, station: Station, subject: Json) -> None:
-        assert command.at_s is not None  # or it would be untimely
+        assert command.at_s is not None  # otherwise it would be untimely
         station.pilot_came()
         try:
             until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))

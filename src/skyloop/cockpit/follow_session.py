@@ -1,8 +1,8 @@
-"""One page's flight after a target it marked: from its box to set-points and messages to the page. On the event loop.
+"""One page's flight after a target that it marked: from the box to set-points and messages. On the event loop.
 
-A box is only tracked until the page sets a mode, with the box or later (:meth:`FollowSession.fly`). In flight, each
-report of the :class:`~skyloop.cockpit.target_tracker.TargetTracker` is one set-point; after :data:`STOPPED_S` without
-a new frame the vehicle hovers until frames come back.
+The content of a box is only tracked until the page sets a mode, either with the box or later
+(:meth:`FollowSession.fly`). In flight, each report from the :class:`~skyloop.cockpit.target_tracker.TargetTracker`
+yields one set-point; after :data:`STOPPED_S` without a new frame, the vehicle hovers until frames arrive again.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import PilotConnection
     from skyloop.messages import AnyAction
 
-STOPPED_S: Final = 0.5  #: the vehicle hovers after this long without a new frame
-OLD_S: Final = 1.0  #: frames older than this when tracked are not flown by either
+STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
+OLD_S: Final = 1.0  #: frames older than this when tracked are not used for flying either
 OLD_FEEDBACK_S: Final = 1.0
-#: A request older than this no longer sets off: the tracker was stuck, or took longer to catch up than anyone expects.
+#: A request older than this no longer starts a flight: the tracker was stuck, or took longer than anyone expects.
 SET_OFF_S: Final = 10.0
-WATCH_S: Final = 0.1  #: between checks that the tracker still reports
-NUMBERS_PERIOD_S: Final = 0.2  #: between two messages that differ only in numbers
+WATCH_S: Final = 0.1  #: interval between checks that the tracker still reports
+NUMBERS_PERIOD_S: Final = 0.2  #: interval between messages that differ only in numbers
 JOIN_S: Final = 2.0
 NO_CONTROL: Final = "this page has lost control"
 _WHAT: Final = "following a target"
@@ -45,7 +45,7 @@ Json = dict[str, Any]
 
 
 class FollowerFactory(Protocol):
-    """Creates a follower for one target, as :class:`skyloop.control.target_follower.TargetFollower` is created."""
+    """Creates a follower for one target; called like :class:`skyloop.control.target_follower.TargetFollower`."""
 
     def __call__(
         self,
@@ -59,12 +59,12 @@ class FollowerFactory(Protocol):
 
 
 class FollowSession:
-    """Tracks one target at a time for a page, and flies after it. On the event loop.
+    """Tracks one target at a time for a page and follows it. On the event loop.
 
     Args:
-        drone: Provides the frames; may be an observer.
+        drone: Provides the frames; may be connected as an observer.
         send: Sends a message to the page.
-        clear: Ends any other flight of the page; called before the first set-point.
+        clear: Ends the page's other flights; called before the first set-point.
         make: Creates followers; called on a thread.
         clock: This process's monotonic clock [ns].
     """
@@ -82,15 +82,15 @@ class FollowSession:
         self._clear = clear
         self._make = make
         self._clock = clock
-        self._keeper: FrameKeeper | None = None  # while a person draws a box
+        self._keeper: FrameKeeper | None = None  # set while a person draws a box
         self._tracker: TargetTracker | None = None
         self._camera = ""
         self._mode = ""
         self._distance_m = 0.0
-        self._limits: dict[str, Value] = {}  # the drone's, read when the target was marked
-        self._pilot: PilotConnection | None = None  # while it flies or is about to
+        self._limits: dict[str, Value] = {}  # the drone's limits, read when the target was marked
+        self._pilot: PilotConnection | None = None  # set while it flies or is about to
         self._flying = False
-        self._waits = ""  # why it hovers for now
+        self._waits = ""  # why it is currently hovering
         self._action: AnyAction | None = None  # the last set-point
         self._report: TrackReport | None = None
         self._reported_ns = 0
@@ -102,7 +102,7 @@ class FollowSession:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it commands the vehicle or is about to."""
+        """Whether it commands the vehicle, or is about to."""
         return self._pilot is not None
 
     # Requests of the page --------------------------------------------------------------------------------------
@@ -127,15 +127,15 @@ class FollowSession:
         )
 
     async def begin(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track the content of a box; with a mode, fly after it once the tracker has caught up.
+        """Track the content of a box; with a mode, follow it once the tracker has caught up.
 
         Args:
             command: The page's command.
-            held: Returns the connection that holds the authority, and raises if there is none or a newer command was
-              given; called only with a mode, at the beginning and before the flight.
+            held: Returns the connection that holds the authority; raises if there is none or a newer command was given.
+                Called only if there is a mode, at the beginning and before the flight.
 
         Raises:
-            AuthorityError: There is a mode, and this page does not hold the authority.
+            AuthorityError: There is a mode, but this page does not hold the authority.
             RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command was given.
             UsageError: The box, mode, distance or camera is invalid.
             MissingExtraError: OpenCV is not installed.
@@ -154,7 +154,7 @@ class FollowSession:
         box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
         pilot = None if command.mode is None else held()
         self.end("another target was marked")
-        self._keeper = None  # the tracker owns it now
+        self._keeper = None  # owned by the tracker from now on
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
         self._distance_m = settings.distance_m
         settings = settings.within(self._limits)
@@ -173,7 +173,7 @@ class FollowSession:
         self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
-        """Fly after the tracked target, or change the mode of following.
+        """Follow the tracked target, or change the mode of following.
 
         Raises:
             RefusedError: Nothing is tracked, or the vehicle is not in the air.
@@ -189,12 +189,12 @@ class FollowSession:
             tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
-        self._pilot, self._asked_ns = pilot, self._clock()  # sets off with the report after catching up
+        self._pilot, self._asked_ns = pilot, self._clock()  # the flight starts with the first report after catching up
         tracker.steers = True
         self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End a flight because something else is commanded or control was lost; tracking alone continues."""
+        """End a flight because something else was commanded or control was lost; tracking continues."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -202,8 +202,8 @@ class FollowSession:
         """Forget the target.
 
         Args:
-            why: The reason for the page; empty if the person wanted it.
-            hover: Hover, if the vehicle was following; False if something else is commanded.
+            why: The reason shown on the page; empty if the person requested it.
+            hover: Whether to hover if the vehicle was following; False if something else is commanded.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:
@@ -223,7 +223,7 @@ class FollowSession:
         self._report = None
 
     async def close(self) -> None:
-        """Forget the target and the frames, and wait for their threads."""
+        """Forget the target and the frames, and wait for their threads to end."""
         self.end()
         if self._keeper is not None:
             self._keeper.close()
@@ -250,8 +250,8 @@ class FollowSession:
         self._send_state()
 
     def _set_off(self) -> None:
-        """Send the first set-point, which ends any other flight."""
-        pilot, self._pilot = self._pilot, None  # or clearing would end this flight, too
+        """Send the first set-point, ending any other flight."""
+        pilot, self._pilot = self._pilot, None  # otherwise clearing would end this flight, too
         self._clear()
         self._pilot, self._flying, self._action = pilot, True, None
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
@@ -259,7 +259,7 @@ class FollowSession:
             self._steer(self._report.action)
 
     def _steer(self, action: AnyAction | None) -> None:
-        """Send a set-point, or hover without new frames or a known motion; raises on the first problem."""
+        """Send a set-point; hover if there are no new frames or the motion is unknown. Raise on the first problem."""
         pilot = self._pilot
         assert pilot is not None
         waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker is not reporting")
@@ -272,7 +272,7 @@ class FollowSession:
                     pilot.let_go(self._waits)
                 return
             if not pilot.command(action):
-                pilot.idle()  # or it would still be carried out if the link came back soon
+                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
                 raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
             self._action = action
         except AuthorityError:
@@ -281,7 +281,7 @@ class FollowSession:
             self.end(str(error))
 
     def _stopped(self) -> str:
-        """Return why nothing can be flown: no frames, or no known motion of the vehicle; empty if it can."""
+        """Return why flying is impossible (no frames, or unknown motion of the vehicle); empty if it is possible."""
         report = self._report
         if report is None:
             return ""
@@ -295,7 +295,7 @@ class FollowSession:
         return ""
 
     def _on_watch(self) -> None:
-        """Hover if the tracker has not reported for too long: its thread is stuck or starved."""
+        """Hover if the tracker has not reported for too long, because its thread is stuck or starved."""
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
         if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
             self._steer(None)
@@ -308,7 +308,7 @@ class FollowSession:
             self._send({"type": "follow", "state": "selecting", "camera": camera, "since_ns": str(since_ns)})
 
     def _send_state(self, state: str = "", why: str = "") -> None:
-        """Send the state: each change at once, numbers at most every :data:`NUMBERS_PERIOD_S`."""
+        """Send the state: changes immediately, numbers at most once per :data:`NUMBERS_PERIOD_S`."""
         if not state:
             if self._tracker is None:
                 return
@@ -317,10 +317,10 @@ class FollowSession:
         status = None if report is None else report.status
         phase = "starting" if status is None or report is None or not report.caught_up else str(status.phase)
         if phase != "starting" and not self._flying and state != "ended":
-            phase = ""  # a law without set-points has no phase
+            phase = ""  # a control law that sends no set-points has no phase
         problem = why if state == "ended" or status is None else self._waits or status.problem
         now_ns = self._clock()
-        # While it waits, only the age grows: that is no change.
+        # While it waits, only the age increases, which is not a change.
         sent = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
         if sent == self._last_sent and now_ns - self._last_sent_ns < nanoseconds(NUMBERS_PERIOD_S):
             return
@@ -343,7 +343,7 @@ class FollowSession:
 
 
 def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
-    """Return a command's box in pixels of the frame, also if the page received the picture in another size.
+    """Convert a command's box to pixels of the frame, even if the page received the picture in another size.
 
     Args:
         command: The page's command.
@@ -366,7 +366,7 @@ def _settings(distance_m: float | None) -> ChaseSettings:
 
 
 def _check_in_air(pilot: PilotConnection) -> Feedback:
-    """Return the newest feedback of a vehicle that is in the air and not in others' hands."""
+    """Return the newest feedback, checking that the vehicle is in the air and nobody else has control."""
     feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
     if feedback.others:
         raise RefusedError(f"{feedback.others}: hover first to take it over")

@@ -1,13 +1,13 @@
-"""Accepts connections at the listening socket, and limits their number and their silence.
+"""Accept connections on the listening socket, and limit their number and how long they may be silent.
 
-A connection is *anonymous* until it has sent a request of an admitted person. Anonymous connections have few places,
-and the newest always gets one: a connection of the address with most of them is closed, one whose request was not
-admitted before the oldest. A flood of strangers therefore displaces itself, and a person who sends a request at once
-is served in the midst of it. Logged-in people have separate places, some reserved for pilots, which no other
-connection can take away. These decisions take the time as an argument.
+A connection is *anonymous* until it has sent a request from an admitted person. There are few places for anonymous
+connections, and the newest always gets one: a connection from the address that has the most is closed, preferably one
+whose request was not admitted, otherwise the oldest. A flood of strangers therefore displaces itself, and a person who
+sends a request at once is served even during a flood. Logged-in people have separate places, some reserved for pilots,
+which no other connection can take. These decisions take the time as an argument.
 
-asyncio's own listener accepts connections until no descriptors are left, and then logs errors without end; therefore
-this module accepts, and hands connections to the HTTP server.
+asyncio's own listener accepts connections until it runs out of descriptors, and then logs errors endlessly. This module
+therefore accepts connections itself and hands them to the HTTP server.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.access import Person
 from skyloop.messages import Role
 
-MAX_ANONYMOUS: Final = 128  #: enough for everyone logging in at one time
+MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
 MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six, and several may share an address
 MAX_KNOWN: Final = 512  #: a page that shows a drone with two cameras has about eight
-MAX_KNOWN_OF_ADDRESS: Final = 192  #: of one role; a page, a class-room behind one router, a measuring program
-_PILOTS_SHARE: Final = 0.25  # of the known, reserved for pilots
-DESCRIPTORS_LEFT: Final = 128  #: reserved for drones, recordings, children and files
+MAX_KNOWN_OF_ADDRESS: Final = 192  #: for people in one role: a page, a classroom behind one router, a measuring program
+_PILOTS_SHARE: Final = 0.25  # fraction of the known connections reserved for pilots
+DESCRIPTORS_LEFT: Final = 128  #: number reserved for drones, recordings, children and files
 
-HEADER_S: Final = 5.0  #: for a TLS handshake and a whole request
-NEXT_S: Final = 10.0  #: for the next request of a connection; the server closes idle ones sooner
-ANSWER_S: Final = 30.0  #: for a stranger's request and its answer
+HEADER_S: Final = 5.0  #: time limit for a TLS handshake and a whole request
+NEXT_S: Final = 10.0  #: time limit for the next request on a connection; the server closes idle ones sooner
+ANSWER_S: Final = 30.0  #: time limit for a stranger's request and its answer
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """How many connections of each kind are allowed."""
+    """The number of connections of each kind that are allowed."""
 
     anonymous: int = MAX_ANONYMOUS
     anonymous_of_address: int = MAX_ANONYMOUS_OF_ADDRESS
@@ -50,7 +50,7 @@ class Places:
 
     @property
     def observers(self) -> int:
-        """The known connections allowed to observers: the others are reserved for pilots."""
+        """The known connections available to observers; the others are reserved for pilots."""
         return self.known - round(self.known * _PILOTS_SHARE)
 
     @classmethod
@@ -63,12 +63,12 @@ class Places:
 
 @dataclass(eq=False, slots=True)
 class Connection:
-    """An open connection. ``end`` closes it at once; ``person`` was admitted over it."""
+    """An open connection. ``end`` closes it at once; ``person`` is who was admitted over it."""
 
     address: str
     end: Callable[[], None]
     person: Person | None = None
-    deadline_ns: int | None = None  #: closed if nothing happens by then
+    deadline_ns: int | None = None  #: closed if nothing happens by this time
     asked: bool = False  #: whether it has sent a stranger's request
 
 
@@ -76,20 +76,20 @@ class Connection:
 class AdmissionCounts:
     """Counts since the start."""
 
-    displaced: int = 0  #: anonymous connections closed in favour of a newer one
-    timed_out: int = 0  #: connections closed for their silence
+    displaced: int = 0  #: anonymous connections closed in favour of newer ones
+    timed_out: int = 0  #: connections closed because they were silent
     refused: int = 0  #: requests refused because the person had too many connections
 
 
 @dataclass
 class Admission:
-    """Keeps the list of open connections. Not thread-safe."""
+    """Keeps track of open connections. Not thread-safe."""
 
     places: Places = field(default_factory=Places)
     counts: AdmissionCounts = field(default_factory=AdmissionCounts)
 
     def __post_init__(self) -> None:
-        self._anonymous: dict[str, dict[Connection, None]] = {}  # by address, the oldest first
+        self._anonymous: dict[str, dict[Connection, None]] = {}  # by address, oldest first
         self._known: dict[Connection, None] = {}
 
     @property
@@ -103,7 +103,7 @@ class Admission:
         return len(self._known)
 
     def opened(self, connection: Connection, now_ns: int) -> None:
-        """Add a new connection, and close the one whose place it takes, if any."""
+        """Add a new connection, and close the connection whose place it takes, if any."""
         if len(self._anonymous.get(connection.address, ())) >= self.places.anonymous_of_address:
             self._displace(connection.address)
         elif self.anonymous >= self.places.anonymous:
@@ -112,20 +112,20 @@ class Admission:
         connection.deadline_ns = now_ns + nanoseconds(HEADER_S)
 
     def shed(self) -> None:
-        """Close an anonymous connection of the address that has most of them."""
+        """Close an anonymous connection from the address that has the most."""
         if self._anonymous:
             self._displace(max(self._anonymous, key=lambda address: len(self._anonymous[address])))
 
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
-        """Record that a complete request has arrived.
+        """Record that a complete request arrived.
 
         Args:
-            connection: The request's connection.
-            person: Who sent it, None for a stranger.
+            connection: The connection that the request arrived on.
+            person: Who sent it; None for a stranger.
             now_ns: The monotonic clock [ns].
 
         Returns:
-            Why it is refused; empty if it is not.
+            Why the request is refused; empty if it is not.
         """
         if person is None:
             connection.asked = True
@@ -143,11 +143,11 @@ class Admission:
         return ""
 
     def answered(self, connection: Connection, now_ns: int) -> None:
-        """Record that the answer was sent: the connection now waits for the next request."""
+        """Record that the answer was sent and the connection waits for its next request."""
         connection.deadline_ns = now_ns + nanoseconds(NEXT_S)
 
     def closed(self, connection: Connection) -> None:
-        """Remove a closed connection; does nothing for one that is not listed."""
+        """Remove a closed connection; do nothing if it is not listed."""
         self._known.pop(connection, None)
         of_address = self._anonymous.get(connection.address, {})
         of_address.pop(connection, None)
@@ -155,7 +155,7 @@ class Admission:
             self._anonymous.pop(connection.address, None)
 
     def end_overdue(self, now_ns: int) -> None:
-        """Close the connections that were silent for too long."""
+        """Close the connections that have been silent for too long."""
         everybody = [*self._known, *(one for connections in self._anonymous.values() for one in connections)]
         for connection in everybody:
             if connection.deadline_ns is not None and now_ns >= connection.deadline_ns:
@@ -163,7 +163,7 @@ class Admission:
                 self._end(connection)
 
     def _full(self, connection: Connection, person: Person) -> str:
-        """Return why this person gets no further connection from this address; empty if they do."""
+        """Return why this person gets no further connection from this address; empty if one is allowed."""
         role, places = person.role, self.places
         roles = Counter(one.person.role for one in self._known if one.person is not None and one is not connection)
         here = sum(
@@ -181,8 +181,8 @@ class Admission:
         return ""
 
     def _displace(self, address: str) -> None:
-        # Strangers that have sent a request, such as a wrong token, go first: otherwise a guesser whose answers are
-        # delayed would end the handshakes of people at the same address.
+        # Strangers that have sent a request, such as a wrong token, are closed first; otherwise a guesser, whose
+        # answers are delayed, could cut off the handshakes of people at the same address.
         self.counts.displaced += 1
         of_address = self._anonymous[address]
         self._end(next((one for one in of_address if one.asked), next(iter(of_address))))
@@ -192,17 +192,17 @@ class Admission:
         connection.end()
 
 
-BACKLOG: Final = 1024  #: connections queued by the kernel; clients retry a dropped one after 1 s
+BACKLOG: Final = 1024  #: connections queued by the kernel; a client retries a dropped one after 1 s
 AT_ONCE: Final = 16  #: connections accepted before the open ones get a turn
-PAUSE_S: Final = 0.1  #: after the system refused a connection for lack of resources
-SWEEP_S: Final = 0.5  #: between two sweeps that close silent connections
+PAUSE_S: Final = 0.1  #: pause after the system refused a connection for lack of resources
+SWEEP_S: Final = 0.5  #: interval between sweeps that close silent connections
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
-_MAX_MESSAGES: Final = 256  # remembered by a filter; enough, as the program has fewer
+_MAX_MESSAGES: Final = 256  # messages remembered by a filter; enough, because the program has fewer kinds
 
 _log = logging.getLogger(__name__)
 
-#: Creates the HTTP protocol of one connection.
+#: Creates the HTTP protocol for one connection.
 ProtocolFactory = Callable[[Connection], asyncio.Protocol]
 
 
@@ -219,13 +219,13 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as far as the admission has places. On the event loop.
+    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop.
 
     Args:
-        listening: Already bound.
+        listening: The listening socket, already bound.
         admission: Counts the connections.
-        protocol: Creates the HTTP protocol of a connection.
-        tls: For HTTPS.
+        protocol: Creates the HTTP protocol for a connection.
+        tls: The TLS context for HTTPS.
         clock: The monotonic clock [ns].
     """
 
@@ -245,7 +245,7 @@ class Listener:
         self._handing_over: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Accept connections until cancelled; open connections stay open."""
+        """Accept connections until cancelled. Open connections stay open."""
         self._listening.setblocking(False)
         self._listening.listen(BACKLOG)
         sweeping = asyncio.create_task(self._sweep())
@@ -268,7 +268,7 @@ class Listener:
                 if error.errno in _NO_ROOM:
                     self._admission.shed()
                     _log.warning("can't accept connections: %s", error.strerror)
-                # Other errors concern the one connection to accept, which is gone again.
+                # Other errors only affect the connection being accepted, which is gone.
                 await asyncio.sleep(PAUSE_S if error.errno in _NO_ROOM else 0)
                 continue
             self._open(bare, str(address[0]))
@@ -305,7 +305,7 @@ class Listener:
 
 
 def places_here() -> Places:
-    """Return the places that this process's limit of descriptors allows."""
+    """Return the number of places that this process's descriptor limit allows."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -315,7 +315,7 @@ def places_here() -> Places:
 
 
 def _shut(accepted: socket.socket) -> None:
-    """Shut a connection down; its protocol, or the handshake, then reads the end of file and closes it."""
+    """Shut a connection down, so that its protocol or the handshake reads the end of file and closes it."""
     with suppress(OSError):  # already closed
         accepted.shutdown(socket.SHUT_RDWR)
 
@@ -327,10 +327,10 @@ def limit_messages() -> None:
 
 
 class RepeatLimit(logging.Filter):
-    """A log filter that passes each message once in ``every_s`` [s], with the number of those dropped since.
+    """A log filter that passes each message once per ``every_s`` [s], with the number of those dropped in between.
 
-    Messages that differ only in their values count as equal. It remembers 256 messages, and forgets the one passed
-    longest ago first.
+    Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
+    one that it passed longest ago.
 
     Args:
         every_s: The period [s].
@@ -341,7 +341,7 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # by message without values: when, and how many since
+        self._logged: dict[str, tuple[int, int]] = {}  # by message without values: time, number dropped since
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to log a record."""
@@ -352,7 +352,7 @@ class RepeatLimit(logging.Filter):
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        self._logged.pop(key, None)  # keeps them ordered by the time they were passed
+        self._logged.pop(key, None)  # keeps the messages ordered by the time they were passed
         if len(self._logged) >= _MAX_MESSAGES:
             del self._logged[next(iter(self._logged))]
         self._logged[key] = now_ns, 0

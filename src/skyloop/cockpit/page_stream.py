@@ -1,7 +1,7 @@
-"""One camera as H.264 on one page: selects its form and its pictures. On the event loop.
+"""One camera as H.264 on one page: choose its form and its pictures. On the event loop.
 
-Pages that keep up share a form. A page whose acknowledgements come late gets its own stream, whose rate and size
-follow the path to this page, until nothing has been late for a while.
+Pages that keep up share a form. A page whose acknowledgements arrive late gets its own stream, with a rate and size
+adapted to the path to that page, until nothing has been late for a while.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from skyloop.messages import CameraInfo, EncodedFrame
 if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
 
-LATE_S: Final = 0.25  #: a picture acknowledged later than this is late
-FALLS_BEHIND_S: Final = 1.0  #: a page whose pictures were all late for this long gets its own stream
-QUIET_S: Final = 10.0  #: without a late picture for this long it shares one again; doubled by each relapse
+LATE_S: Final = 0.25  #: a picture acknowledged after more than this is late
+FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all pictures were late for this long
+QUIET_S: Final = 10.0  #: after this long without a late picture it shares a stream again; doubles with each relapse
 MOST_QUIET_S: Final = 160.0
 SILENT_S: Final = 3.0  #: give up on a form after this much silence
-RETRY_S: Final = 10.0  #: until it is retried, doubled each time …
-MOST_RETRY_S: Final = 300.0  #: … up to this: each retry makes a refusing proxy report it
-MOST_UNDER_WAY: Final = 8  #: pictures sent and not yet acknowledged
-MOST_BYTES: Final = 1_000_000  #: of these, unless a single one is larger
+RETRY_S: Final = 10.0  #: pause before trying it again, doubled each time …
+MOST_RETRY_S: Final = 300.0  #: … up to this: each attempt makes a refusing proxy report it
+MOST_UNDER_WAY: Final = 8  #: number of pictures sent and not yet acknowledged
+MOST_BYTES: Final = 1_000_000  #: total size of these pictures [bytes], unless a single one is larger
 
 
 class PagePath:
-    """Judges by its acknowledgements whether a page keeps up. Pure: the time is an argument."""
+    """Judges from its acknowledgements whether a page keeps up. Pure: the time is an argument."""
 
     def __init__(self) -> None:
-        self.behind = False  #: it needs less than other pages get
-        self.late_here = False  #: and not by its own path: pictures reached the cockpit late
-        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time of sending
-        self._trip_s = 0.0  # of the newest acknowledged
+        self.behind = False  #: whether it needs a lower rate than other pages get
+        self.late_here = False  #: whether that is not because of its own path: pictures reached the cockpit late
+        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time sent
+        self._trip_s = 0.0  # round-trip time of the newest acknowledged picture
         self._changed_ns: int | None = None  # since when all are late, or none is
         self._was_late = False
         self._quiet_s = QUIET_S
@@ -52,15 +52,15 @@ class PagePath:
 
     @property
     def waiting(self) -> int:
-        """The number of pictures under way."""
+        """The number of pictures in flight."""
         return len(self._under_way)
 
     def sent(self, number: int, size: int, now_ns: int) -> None:
-        """Record a picture that was sent, with its size in bytes."""
+        """Record that a picture was sent, with its size in bytes."""
         self._under_way.append((number, size, now_ns))
 
     def acknowledged(self, number: int, now_ns: int) -> int:
-        """Record that the page has a picture and all before it; return how many were new."""
+        """Record that the page has a picture and all earlier ones; return how many of them were new."""
         count = 0
         while self._under_way and self._under_way[0][0] <= number:
             self._trip_s = seconds(now_ns - self._under_way.popleft()[2])
@@ -71,8 +71,8 @@ class PagePath:
         """Update the judgement; return whether the page is behind.
 
         Args:
-            now_ns: The present time.
-            extra_s: How long pictures take to reach the cockpit [s].
+            now_ns: The current time.
+            extra_s: Time that pictures take to reach the cockpit [s].
         """
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
@@ -97,7 +97,7 @@ class Sent:
     picture: EncodedFrame
     form: Form
     age_s: float
-    late_here: bool = False  #: the form is the page's own because pictures reach the cockpit late
+    late_here: bool = False  #: whether the page has its own form because pictures reach the cockpit late
 
 
 class PageStream:
@@ -122,31 +122,31 @@ class PageStream:
         clock: Clock = monotonic_ns,
     ) -> None:
         self.path = PagePath()
-        self.skipped = 0  #: pictures not sent, because the page could not have decoded them
+        self.skipped = 0  #: number of pictures not sent because the page could not have decoded them
         self._station = station
         self._camera = camera
         self._width = width
         self._max_fps = max_fps
         self._wake = wake
         self._clock = clock
-        self._name = ""  # of the page's own stream, while it has one
+        self._name = ""  # name of the page's own stream, if it has one
         self._feed: EncodedFeed | None = None
-        self._next: EncodedFeed | None = None  # replaces it at its first key picture
-        self._serial = 0  # of the last picture sent
-        self._follows = True  # the page can decode the one after it
-        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, with the newest picture of each
-        self._late_s = 0.0  # of the newest picture when it reached the cockpit
-        self._missed = 0  # pictures missed before those that are ready
+        self._next: EncodedFeed | None = None  # will replace the current form at its first key picture
+        self._serial = 0  # number of the last picture sent
+        self._follows = True  # whether the page can decode the picture after that
+        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, each with its newest picture
+        self._late_s = 0.0  # delay of the newest picture when it reached the cockpit
+        self._missed = 0  # number of pictures missed before those that are ready
         self._refused_ns: int | None = None
         self._retry_s = RETRY_S
 
     @property
     def shows(self) -> bool:
-        """Whether the page receives it; until it does, it still needs other pictures."""
+        """Whether the page receives these pictures; until it does, it needs others."""
         return self._feed is not None
 
     def resize(self, width: int) -> None:
-        """Set the new width of the pane [device pixels]."""
+        """Set the pane's new width [device pixels]."""
         self._width = width
 
     def take(self) -> list[Sent]:
@@ -172,13 +172,13 @@ class PageStream:
         return [Sent(one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures]
 
     def sent(self, number: int, one: Sent) -> None:
-        """Record the message number of a picture from :meth:`take`."""
+        """Record the message number of pictures from :meth:`take`."""
         if self._feed is not None:
             self._numbers.append((number, self._feed, one.picture.seq))
             self.path.sent(number, len(one.picture.data), self._clock())
 
     def acknowledged(self, number: int) -> int:
-        """Handle the page's report that it drew or skipped pictures; return how many were new."""
+        """Handle the page's report that it has drawn or skipped pictures; return how many were new."""
         newest = None
         while self._numbers and self._numbers[0][0] <= number:
             newest = self._numbers.popleft()
@@ -187,7 +187,7 @@ class PageStream:
         return self.path.acknowledged(number, self._clock())
 
     def restart(self) -> None:
-        """Resume at a key picture, because the page can't decode the next one."""
+        """Resume at a key picture, because the page can't decode the next picture."""
         self._follows = False
 
     def close(self) -> None:
@@ -201,14 +201,14 @@ class PageStream:
             self._name = ""
 
     def _ready(self, feed: EncodedFeed, serial: int) -> list[Numbered[EncodedFrame]]:
-        """Return the pictures of a form that the page can decode after ``serial``; request a key picture if none."""
+        """Return a form's pictures that the page can decode after ``serial``; if none, request a key picture."""
         pictures, self._missed = feed.after(serial, follows=self._follows)
         if not pictures and self._missed:
             feed.ask_for_key()
         return pictures
 
     def _choose(self) -> None:
-        """Subscribe to the form that suits the page now; the present one stays until a key picture of it arrives."""
+        """Subscribe to the form that suits the page now. The current one is used until a key picture arrives."""
         form = form_for(self._camera, self._width, self._max_fps)
         if self.path.update(self._clock(), self._late_s):
             self._name = self._name or self._station.own_name()
@@ -224,7 +224,7 @@ class PageStream:
         self._release(self._next)
         self._next = None
         if self._feed is not None and self._feed.form == form:
-            return  # back to the present form before the other one arrived
+            return  # it returned to the current form before the other one arrived
         feed = self._station.encoded(self._camera.name, form)
         with suppress(SkyloopError):  # the drone is being closed
             feed.subscribe(self, self._wake)

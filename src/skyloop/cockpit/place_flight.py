@@ -1,6 +1,6 @@
-"""One page's flights to a place, back to the start or along a route: their commands and their end.
+"""One page's flights to a place, back to the start or along a route: how they are commanded and how they end.
 
-:class:`skyloop.control.route_law.RouteLaw` decides the course of a route. On the event loop.
+:class:`skyloop.control.route_law.RouteLaw` decides how a route is flown. On the event loop.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: maximum speed on the way to a place
-PERIOD_S: Final = 0.05  #: between checks whether it has arrived
+PERIOD_S: Final = 0.05  #: interval between checks whether it has arrived
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
 
@@ -35,8 +35,8 @@ class Leg:
 
     Attributes:
         action: The command to send.
-        goal: The place it leads to.
-        is_over: Returns whether the newest feedback shows that it is over.
+        goal: The place to fly to.
+        is_over: Returns whether the newest feedback shows that the flight is over.
     """
 
     action: Position | ReturnToStart
@@ -45,12 +45,12 @@ class Leg:
 
 
 def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
-    """Return the flight to the place in a command.
+    """Return the flight to the place given in a command.
 
     Raises:
-        RefusedError: The vehicle can't be flown to places now.
+        RefusedError: The vehicle can't currently be flown to places.
         UsageError: A coordinate is out of range.
-        LinkError: No feedback is known.
+        LinkError: No feedback has been received.
     """
     _fit_for_places(pilot, "it can't be flown to a place")
     goal = Waypoint(command.x, command.y, command.z, command.yaw)
@@ -59,11 +59,11 @@ def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
 
 
 def to_start(pilot: PilotConnection) -> Leg:
-    """Return the flight back to the place of take-off.
+    """Return the flight back to the take-off position.
 
     Raises:
-        RefusedError: The vehicle can't be flown to places now, or its start is unknown.
-        LinkError: No feedback is known.
+        RefusedError: The vehicle can't currently be flown to places, or its take-off position is unknown.
+        LinkError: No feedback has been received.
     """
     start = _fit_for_places(pilot, "it can't return to its start").start_position_m
     if start is None:
@@ -77,15 +77,15 @@ def to_start(pilot: PilotConnection) -> Leg:
 
 
 class PlaceFlight:
-    """Watches one flight to a place at a time, and shows its goal.
+    """Monitors one flight to a place at a time, and shows its goal.
 
-    It ends on arrival, and on the first problem.
+    A flight ends on arrival or at the first problem.
 
     Args:
         station: The drone.
         app: The name under which the page flies.
         done: Called on arrival, with the command's kind and number.
-        refused: Called if the flight ended on the way, with the command's kind and number, and the reason.
+        refused: Called if the flight ended before arrival, with the command's kind and number, and the reason.
     """
 
     def __init__(
@@ -103,13 +103,13 @@ class PlaceFlight:
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
-        """Watch a flight that was commanded."""
+        """Monitor a flight that was commanded."""
         self.cancel()
         self._station.goals[self._app] = leg.goal
         self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
-        """Stop watching, because something else is commanded."""
+        """Stop monitoring, because something else was commanded."""
         self._station.goals.pop(self._app, None)
         if self._job is not None:
             self._job.cancel()
@@ -137,7 +137,7 @@ class PlaceFlight:
 
 
 def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
-    """Return the newest feedback of a vehicle that can be flown to places now; :class:`RefusedError` if it can't."""
+    """Return the newest feedback; raise :class:`RefusedError` if the vehicle can't currently be flown to places."""
     feedback = pilot.feedback()
     problem = lacking(feedback)
     if problem:
@@ -147,19 +147,19 @@ def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
     return feedback
 
 
-OLD_S: Final = 1.0  #: feedback that is older pauses the route
+OLD_S: Final = 1.0  #: a route is paused if feedback is older than this
 
 
 class RouteSession:
     """A page's flight along a route.
 
     Args:
-        route: Already checked.
-        pilot: Holds the authority.
+        route: The route, already checked.
+        pilot: The connection that holds the authority.
         drone: Provides the frames to save.
         folder: Where photos are saved.
         send: Sends a message to the page.
-        aim: Called with the present goal; None for none.
+        aim: Called with the current goal, or None.
     """
 
     def __init__(
@@ -183,11 +183,11 @@ class RouteSession:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it commands the vehicle now."""
+        """Whether it currently commands the vehicle."""
         return self.law.is_under_way
 
     def begin(self) -> None:
-        """Fly to the first waypoint, and watch the flight in a task until :meth:`end`.
+        """Fly to the first waypoint, and monitor the flight in a task until :meth:`end`.
 
         Raises:
             SkyloopError: The drone is on the ground, its position is unknown, or the command was not sent.
@@ -196,19 +196,19 @@ class RouteSession:
         self._job = asyncio.create_task(self._watch())
 
     def pause(self, why: str = "", *, hover: bool = True) -> None:
-        """Pause; without ``hover`` because something else is commanded or control was lost."""
+        """Pause. Without ``hover``, something else was commanded or control was lost."""
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
-        """Fly on."""
+        """Resume the flight."""
         self._ask(self.law.resume)
 
     def skip(self) -> None:
-        """Skip the present waypoint."""
+        """Skip the current waypoint."""
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
-        """End it for good; without ``hover`` because something else is commanded or control was lost."""
+        """End the route permanently. Without ``hover``, something else was commanded or control was lost."""
         if self._job is not None:
             self._job.cancel()
         self._carry_out(self.law.stop(), send=hover)
@@ -255,13 +255,13 @@ class RouteSession:
 
     def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
-        if automatic and not isinstance(action, Position):  # the route ends so, not a person
+        if automatic and not isinstance(action, Position):  # the route ended this way, not a person
             pilot.let_go("its route ended", land=isinstance(action, Land))
             return
         if pilot.command(action):
             return
         with suppress(SkyloopError):
-            pilot.idle()  # or it would still be carried out if the link came back soon
+            pilot.idle()  # otherwise it would still be carried out if the link were restored soon
         raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
 
     def _send_progress(self, step: Progress) -> None:

@@ -1,7 +1,7 @@
-"""The files in the folder of recordings: rename, annotate, move to the trash and restore. Blocking.
+"""The files in the recordings folder: rename, annotate, move to the trash and restore. Blocking.
 
-Notes on ``flight.mcap`` are kept beside it in ``flight.notes.json``; deleted recordings go to the folder ``trash``
-until it is emptied. Nothing here overwrites a file.
+Notes on ``flight.mcap`` are stored next to it in ``flight.notes.json``. Deleted recordings are moved to the folder
+``trash`` until that is emptied. No file is ever overwritten.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from skyloop.recording.reader import ENDING
 
 TRASH: Final = "trash"
 NOTES_ENDING: Final = ".notes.json"
-MAX_NAME: Final = 100  #: characters
-MAX_NAME_BYTES: Final = 200  #: file systems allow 255, including prefixes and suffixes
-MAX_TEXT: Final = 4000  #: characters of a note
-MAX_MARK: Final = 200  #: characters of a mark
-MAX_MARKS: Final = 200  #: of a recording
+MAX_NAME: Final = 100  #: maximum length of a name [characters]
+MAX_NAME_BYTES: Final = 200  #: maximum length of a name; file systems allow 255 bytes, including prefixes and suffixes
+MAX_TEXT: Final = 4000  #: maximum length of a note [characters]
+MAX_MARK: Final = 200  #: maximum length of a mark [characters]
+MAX_MARKS: Final = 200  #: maximum number of marks per recording
 MAX_AT_S: Final = 1e6
-_MOST_BYTES: Final = 1 << 20  #: of a notes file
-_NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and characters forbidden on other systems
+_MOST_BYTES: Final = 1 << 20  #: maximum size of a notes file
+_NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and characters that other systems forbid
 
 
 class Mark(msgspec.Struct, frozen=True):
     """A marked position in a recording."""
 
-    at_s: float  #: position in the recording, as ``replay.position_s``
+    at_s: float  #: position in the recording, like ``replay.position_s``
     text: str = ""
 
 
@@ -48,10 +48,10 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def check_name(text: str) -> str:
-    """Return the file name, with its suffix, for a recording's name typed by a person.
+    """Return the file name, including suffix, for a recording's name typed by a person.
 
     Raises:
-        UsageError: It is not a valid name; with the reason.
+        UsageError: The name is invalid; the message says why.
     """
     name = unicodedata.normalize("NFC", text).strip()
     name = name.removesuffix(ENDING).rstrip()
@@ -86,11 +86,11 @@ def read_notes(path: Path) -> Notes:
 
 
 def write_text(path: Path, text: str) -> Notes:
-    """Write the note of a recording; an empty one is removed.
+    """Write a recording's note; an empty note is removed.
 
     Raises:
-        UsageError: It is too long or can't be written.
-        FileFormatError: The present notes file can't be read, so it is not overwritten.
+        UsageError: The note is too long or can't be written.
+        FileFormatError: The existing notes file can't be read and is therefore not overwritten.
     """
     if len(text) > MAX_TEXT:
         raise UsageError(f"a note has at most {MAX_TEXT} characters, not {len(text)}")
@@ -118,7 +118,7 @@ def remove_mark(path: Path, mark: Mark) -> Notes:
     """Remove a mark from a recording.
 
     Raises:
-        UnknownNameError: It has no such mark.
+        UnknownNameError: The recording has no such mark.
         FileFormatError: As for :func:`write_text`.
     """
     notes = read_notes(path)
@@ -130,10 +130,10 @@ def remove_mark(path: Path, mark: Mark) -> Notes:
 
 
 def check_mark(text: str) -> None:
-    """Check a mark's text.
+    """Check the text of a mark.
 
     Raises:
-        UsageError: It is too long.
+        UsageError: The text is too long.
     """
     if len(text) > MAX_MARK:
         raise UsageError(f"a mark has at most {MAX_MARK} characters, not {len(text)}")
@@ -147,7 +147,7 @@ def rename(path: Path, name: str) -> str:
 
     Raises:
         UsageError: The name is invalid, or the file can't be moved.
-        RefusedError: A file of that name exists.
+        RefusedError: A file with that name already exists.
     """
     target = path.with_name(check_name(name))
     if target != path:
@@ -159,10 +159,10 @@ def throw_away(path: Path) -> str:
     """Move a recording and its notes to the trash.
 
     Returns:
-        Its name there, with a number if that name was taken.
+        The recording's name in the trash, with a number if its own name was taken.
 
     Raises:
-        UsageError: It can't be moved.
+        UsageError: A file can't be moved.
     """
     trash = path.parent / TRASH
     try:
@@ -180,9 +180,9 @@ def bring_back(folder: Path, name: str) -> str:
     """Move a recording and its notes from the trash back into the folder.
 
     Raises:
-        UnknownNameError: It is not in the trash.
-        RefusedError: A file of that name exists in the folder.
-        UsageError: It can't be moved.
+        UnknownNameError: The recording is not in the trash.
+        RefusedError: A file with that name already exists in the folder.
+        UsageError: A file can't be moved.
     """
     thrown = {path.name: path for path in _recordings(folder / TRASH)}
     if name not in thrown:
@@ -192,7 +192,7 @@ def bring_back(folder: Path, name: str) -> str:
 
 
 def trash_of(folder: Path) -> dict[str, int]:
-    """Return the number of recordings in the trash and their bytes."""
+    """Return the number of recordings in the trash and their total size [bytes]."""
     sizes = []
     for path in _recordings(folder / TRASH):
         with suppress(OSError):
@@ -201,7 +201,7 @@ def trash_of(folder: Path) -> dict[str, int]:
 
 
 def empty_trash(folder: Path) -> None:
-    """Delete everything in the trash for good.
+    """Permanently delete everything in the trash.
 
     Raises:
         UsageError: A file can't be deleted.
@@ -253,10 +253,10 @@ def _move(path: Path, target: Path) -> None:
 
 def _move_one(path: Path, target: Path) -> None:
     try:
-        os.link(path, target, follow_symlinks=False)  # unlike a rename, this never overwrites
+        os.link(path, target, follow_symlinks=False)  # never overwrites, unlike a rename
     except FileExistsError:
         raise
-    except OSError:  # a file system without hard links
+    except OSError:  # the file system does not support hard links
         if target.exists():
             raise FileExistsError from None
         path.rename(target)

@@ -1,8 +1,8 @@
-"""Recordings on the page: start, stop, list, report and replay them.
+"""Recordings on the page: start, stop, list, replay and report on them.
 
-Each runs in its own process, and nothing blocks the event loop: the recorder is a child that does not disturb the
-flight, as is the process that makes a report, and a replay is a private proxy. All of them end with this process,
-however it ends; the number of each is bounded, and they start one at a time.
+Recorders, reports and replays each run in their own process, and nothing blocks the event loop. A recorder is a child
+process that does not disturb the flight, as is a process that creates a report; a replay is a private proxy. All of
+them end when this process ends for any reason. The number of each is limited, and they start one at a time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.recording import Status
 
-REPLAY_S: Final = 60.0  #: for the proxy of a replay to answer: slow on a busy computer, as the page explains
+REPLAY_S: Final = 60.0  #: for a replay's proxy to answer, which is slow on a busy computer, as the page explains
 
 
 class Recorder(Protocol):
@@ -85,13 +85,13 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
 class Replay:
     """A running replay."""
 
-    drone: Drone  #: the observer whose connection keeps its proxy running
+    drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
-    recorded: str | None  #: the drone's name in the recording; None: the first
+    recorded: str | None  #: the drone's name in the recording; None: the first one
 
 
 def progress(status: Status) -> dict[str, Any]:
-    """Return the progress of a recording, as JSON values."""
+    """Return a recording's progress as JSON values."""
     return {
         "path": status.path,
         "state": str(status.state),
@@ -106,9 +106,9 @@ def progress(status: Status) -> dict[str, Any]:
 Json = dict[str, Any]
 T = TypeVar("T")
 
-MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays; each is a process
+MAX_CHILDREN: Final = 8  #: maximum number of simultaneous recordings, and of replays; each is a process
 MOST_LISTED: Final = 500
-NOTE_SHOWN: Final = 200  #: characters of a note in the list
+NOTE_SHOWN: Final = 200  #: number of characters of a note shown in the list
 
 
 class Recordings:
@@ -127,25 +127,25 @@ class Recordings:
         replay: Callable[[Path, str | None], Drone] = start_replay,
     ) -> None:
         self.folder = folder
-        self.replays: dict[str, Replay] = {}  #: by the name of the proxy
+        self.replays: dict[str, Replay] = {}  #: keyed by the proxy's name
         self._record = record
         self._replay = replay
         self.reports = Reports()
         self._timelines = Reports(timeline_command, "time line")
-        self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, the newest last
+        self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, newest last
         self._changing = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._looking = asyncio.Lock()
         self._running: dict[str, Running] = {}
         self._numbers = itertools.count(1)
-        self._known: dict[tuple[Path, int, int], Described] = {}  # descriptions of files, by name, size and time
+        self._known: dict[tuple[Path, int, int], Described] = {}  # descriptions of files, by path, size and time
 
     def drones(self) -> set[str]:
         """Return the names of the drones being recorded."""
         return {name for running in self._running.values() for name in running.drones}
 
     async def start(self, drones: Sequence[str]) -> Json:
-        """Start a recording.
+        """Start recording.
 
         Args:
             drones: The names of the drones.
@@ -154,7 +154,7 @@ class Recordings:
             The recording, as JSON values.
 
         Raises:
-            UsageError: No drone is named, or the folder can't be created.
+            UsageError: No drone was given, or the folder can't be created.
             RefusedError: :data:`MAX_CHILDREN` recordings are already running.
             SkyloopError: The recorder can't start.
         """
@@ -189,15 +189,15 @@ class Recordings:
         return {**entry, **progress(running.recorder.status)}
 
     async def listing(self) -> Json:
-        """Return the running recordings and those in the folder, the newest first."""
+        """Return the running recordings and those in the folder, newest first."""
         running = [self._entry(number) for number in self._running]
-        async with self._looking:  # simultaneous requests cost as much as one
+        async with self._looking:  # simultaneous requests cost no more than one
             past = await asyncio.to_thread(self._past)
             trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
         return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
 
     def mark(self, number: str, text: str) -> tuple[str, ...]:
-        """Check a mark for a running recording, and return the drones it applies to.
+        """Check a mark for a running recording and return the drones it applies to.
 
         Raises:
             UnknownNameError: No such recording is running.
@@ -214,7 +214,7 @@ class Recordings:
         """Return the path of a recording.
 
         Raises:
-            UnknownNameError: There is no such file, or it is being recorded.
+            UnknownNameError: The file does not exist, or is being recorded.
         """
         return await asyncio.to_thread(self._path, name)
 
@@ -222,8 +222,8 @@ class Recordings:
         """Rename or delete a recording that is neither being written nor replayed; return its new name.
 
         Raises:
-            UnknownNameError: There is no such file.
-            RefusedError: It is in use, or ``change`` refuses.
+            UnknownNameError: The file does not exist.
+            RefusedError: The recording is in use, or ``change`` refuses.
         """
         async with self._starting, self._changing:
             for running in self._running.values():
@@ -236,12 +236,12 @@ class Recordings:
             return await asyncio.to_thread(change, path)
 
     async def annotate(self, name: str, write: Callable[[Path], Notes]) -> Notes:
-        """Change the notes of a recording; :class:`UnknownNameError` if there is no such file."""
+        """Change a recording's notes; raise :class:`UnknownNameError` if there is no such file."""
         async with self._changing:
             return await asyncio.to_thread(write, await self.path(name))
 
     async def in_trash(self, work: Callable[[Path], T]) -> T:
-        """Restore something from the folder's trash, or empty it."""
+        """Restore something from the trash, or empty the trash."""
         async with self._changing:
             return await asyncio.to_thread(work, self.folder)
 
@@ -255,10 +255,10 @@ class Recordings:
             recorded: The recorded drone to play; None for the first.
 
         Returns:
-            The name of the proxy.
+            The name of the replay's proxy.
 
         Raises:
-            UnknownNameError: There is no such file.
+            UnknownNameError: The file does not exist.
             RefusedError: :data:`MAX_CHILDREN` replays are already running.
             SkyloopError: The replay can't start.
         """
@@ -270,14 +270,14 @@ class Recordings:
             return drone.name
 
     async def replayed(self, name: str) -> Json:
-        """Return the recording's data for a replay bar.
+        """Return the recording's data for the page's replay bar.
 
         Returns:
             The file's name, the result of :func:`skyloop.cockpit.reports.timeline`, and the notes, as JSON values.
 
         Raises:
             UnknownNameError: No such replay was started here.
-            SkyloopError: Any error of :meth:`skyloop.cockpit.reports.Reports.make`.
+            SkyloopError: Any error from :meth:`skyloop.cockpit.reports.Reports.make`.
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
@@ -330,7 +330,7 @@ class Recordings:
     def _past(self) -> list[Json]:
         found = []
         for path in self._files():
-            with suppress(OSError):  # deleted meanwhile
+            with suppress(OSError):  # deleted in the meantime
                 status = path.stat()
                 found.append((status.st_mtime_ns, path, status.st_size))
         newest = sorted(found, reverse=True)[:MOST_LISTED]
@@ -349,7 +349,7 @@ class Recordings:
 
 
 def _noted(path: Path) -> Json:
-    """Return the beginning of a recording's notes, for its row."""
+    """Return the beginning of a recording's notes, to show in its row."""
     try:
         notes = recording_files.read_notes(path)
     except FileFormatError as error:

@@ -1,4 +1,4 @@
-"""Requests about recordings and replays: observers read, watch and download, pilots also change."""
+"""Requests about recordings and replays. Observers may read, watch and download; pilots may also make changes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
     from skyloop.cockpit.station import Station
 
-#: A report is a complete page with an inline script: it runs without this page's rights.
+#: A report is a complete page with an inline script; it runs without this page's permissions.
 _REPORT_POLICY: Final = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-#: Parameters of a replay, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
+#: A replay's parameters, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = 16_384  #: of any text in a request; its use has a lower limit and reports it
+_MOST_CHARACTERS: Final = 16_384  #: maximum length of any text in a request; each use has a lower limit and reports it
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -115,7 +115,7 @@ class RecordingsApi:
 
     @answered
     async def mark(self, request: Request) -> Response:
-        """Add a mark to a running recording: a log entry for each of its drones."""
+        """Add a mark to a running recording, as a log entry for each of its drones."""
         text = (await body_of(request, _Words)).text
         drones = self._recordings.mark(request.path_params["number"], text)
         for name in drones:
@@ -127,7 +127,7 @@ class RecordingsApi:
 
     @answered
     async def file(self, request: Request) -> Response:
-        """Answer with a recording's file, or the requested range of it."""
+        """Answer with a recording's file, or with the requested range of it."""
         path = await self._recordings.path(request.path_params["name"])
         return FileResponse(path, filename=path.name, media_type="application/octet-stream")
 
@@ -210,14 +210,14 @@ class RecordingsApi:
 
     @answered
     async def play(self, request: Request) -> Response:
-        """Pause, resume or move a replay, or change its speed; answer once the replay has accepted that."""
+        """Pause, resume or move a replay, or change its speed; answer once the replay has accepted the change."""
         wanted = await body_of(request, _Playback)
         name = request.path_params["name"]
         station = self._station(name)
         if not station.drone.uri.startswith("replay:"):
             raise UsageError(f"{name} is not a replay: it can't be paused or moved")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
-        # Pause before moving, and move before resuming: otherwise it would play on from the old position.
+        # Pause before moving, and move before resuming: otherwise it would continue from the old position.
         values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
         pilot = await station.stopper()  # a pilot's connection; this needs no authority
         for parameter, value in values.items():

@@ -1,11 +1,11 @@
-"""Reports on recordings: one at a time, in a child process that ends with its request and with this process.
+"""Create reports on recordings, one at a time, in a child process that ends with its request and with this process.
 
-A report keeps a core busy for seconds, and every observer may request one. Requests therefore wait in a short queue,
-and are refused when it is full; if the client disconnects, its request leaves the queue or its child ends.
+A report keeps a core busy for seconds, and any observer may request one. Requests therefore wait in a short queue and
+are refused when it is full. If a client disconnects, its request is removed from the queue or its child is ended.
 
-A *timeline*, the data of a replay bar, is made in the same way: events, marks and the thinned course of the flight.
+A *timeline*, the data for a replay bar, is created in the same way: events, marks and the thinned course of the flight.
 
-``python -m skyloop.cockpit.reports report|timeline FILE TARGET [DRONE]`` is the child.
+The child runs ``python -m skyloop.cockpit.reports report|timeline FILE TARGET [DRONE]``.
 """
 
 from __future__ import annotations
@@ -35,57 +35,57 @@ if TYPE_CHECKING:
 REPORT: Final = "report"
 TIMELINE: Final = "timeline"
 REPORT_S: Final = 120.0  #: time limit for one report
-MAX_WAITING: Final = 4  #: requests; a longer queue would take minutes
-NICENESS: Final = 10  #: of the child: pages and flights have priority over reports
-_TAKEN: Final = 4096  # bytes kept of a child's error output
+MAX_WAITING: Final = 4  #: maximum number of waiting requests; a longer queue would take minutes
+NICENESS: Final = 10  #: niceness of the child: pages and flights have priority over reports
+_TAKEN: Final = 4096  # bytes kept from a child's error output
 
-#: Returns the command that reports on FILE, writing to TARGET, for DRONE if one is named.
+#: Returns the command that reports on FILE, writing to TARGET, optionally for one DRONE.
 Command = Callable[[Path, Path, str | None], Sequence[str]]
 
 
 def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the command of the child that makes a report."""
+    """Return the command for the child that creates a report."""
     return _child(REPORT, file, target, drone)
 
 
 def timeline_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the command of the child that writes the result of :func:`timeline` as JSON."""
+    """Return the command for the child that writes the result of :func:`timeline` as JSON."""
     return _child(TIMELINE, file, target, drone)
 
 
 def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the command that runs this module as a program."""
+    """Return a command that runs this module as a program."""
     return [sys.executable, "-m", "skyloop.cockpit.reports", what, str(file), str(target), *([drone] if drone else [])]
 
 
 class Reports:
-    """Makes reports, or any other product of a recording, in a child process. On the event loop.
+    """Creates reports, or another product of a recording, in a child process. On the event loop.
 
     Args:
-        command: Returns a child's command line; by default :func:`child_command`.
-        what: The name of the product, for error messages.
+        command: Returns the child's command line; by default :func:`child_command`.
+        what: The name of the product in error messages.
     """
 
     def __init__(self, command: Command | None = None, what: str = "report") -> None:
         self._command = command or child_command
         self._what = what
         self._turn = asyncio.Lock()
-        self._wanted = 0  # reports in progress or queued
+        self._wanted = 0  # number of reports in progress or queued
 
     async def make(self, file: Path, drone: str | None = None) -> str:
-        """Make a report; if cancelled, it leaves nothing behind.
+        """Create a report; if cancelled, leave nothing behind.
 
         Args:
             file: The recording.
             drone: The recorded drone; None for the only one.
 
         Returns:
-            The child's output: a page as made by ``skyloop log report``.
+            The child's output: a page like that of ``skyloop log report``.
 
         Raises:
             RefusedError: The queue is full.
-            UsageError: The child failed; includes its message.
-            LinkError: It took longer than :data:`REPORT_S`.
+            UsageError: The child failed; its message is included.
+            LinkError: Creating it took longer than :data:`REPORT_S`.
         """
         if self._wanted > MAX_WAITING:
             raise RefusedError(
@@ -104,7 +104,7 @@ class Reports:
             target = Path(folder) / "report.html"
             child = await asyncio.create_subprocess_exec(
                 *self._command(file.absolute(), target, drone),
-                stdin=asyncio.subprocess.PIPE,  # closes when this process ends
+                stdin=asyncio.subprocess.PIPE,  # closed when this process ends
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,
             )
@@ -128,7 +128,7 @@ class Reports:
 
 
 def run_child(arguments: Sequence[str]) -> int:
-    """Write a report or timeline, unless standard input closes first: then the requester is gone.
+    """Write a report or timeline, unless standard input closes first, which means that the requester is gone.
 
     Args:
         arguments: ``report`` or ``timeline``, FILE TARGET [DRONE], from the command line.
@@ -157,19 +157,19 @@ def _report(recording: Recording, drone: str, target: Path) -> None:
     write_report(recording, drone, target, pictures=8)
 
 
-MARK: Final = "mark"  #: log name of a mark
-MAX_EVENTS: Final = 300  #: the most severe are kept
+MARK: Final = "mark"  #: name under which marks are logged
+MAX_EVENTS: Final = 300  #: if there are more, the most severe are kept
 MAX_MARKS: Final = 300
 MAX_SAMPLES: Final = 1200
 PERIOD_S: Final = 0.1  #: minimum time between samples
 MAX_TEXT: Final = 200
 _SEVERITIES: Final = (Severity.ERROR, Severity.WARNING)
-#: Events that say nothing about the flight.
+#: Events that are irrelevant to the flight.
 _LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})
 
 
 def timeline(recording: Recording, drone: str) -> dict[str, Any]:
-    """Return the events and course of a recording as JSON values, with positions as in ``replay.position_s``.
+    """Return a recording's events and course as JSON values, with positions like ``replay.position_s``.
 
     Args:
         recording: The recording.
@@ -185,7 +185,7 @@ def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     channels = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.LOGS)
     for item in recording.items(drone, channels):
         if isinstance(item.value, LogEntry) and course.first_ns is None:
-            continue  # replays don't play logs, so a replay does not begin with one
+            continue  # replays don't play logs, so a replay does not start with one
         at_s = round(seconds(course.follow(item.value, item.entry.log_ns) - (course.first_ns or 0)), 3)
         value = item.value
         if isinstance(value, Event) and value.kind not in _LEFT_OUT:

@@ -1,4 +1,4 @@
-"""Routes of the page: files in one folder, and checked routes that are ready to fly."""
+"""The page's routes: files in one folder, and checked routes that are ready to fly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Json = dict[str, Any]
 
 
 class RouteFiles:
-    """The routes in one folder, ``NAME.route.json`` each. Its methods read and write files: call them on a thread.
+    """The routes in one folder, each in a file ``NAME.route.json``. Methods access files, so call them on a thread.
 
     Args:
         folder: Created when needed.
@@ -31,7 +31,7 @@ class RouteFiles:
         self.folder = folder
 
     def listing(self) -> Json:
-        """Return the routes as JSON values, by name; an unreadable file has a problem instead."""
+        """Return the routes as JSON values, by name; for an unreadable file, give the problem instead."""
         files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
         return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
 
@@ -39,7 +39,7 @@ class RouteFiles:
         """Read a route.
 
         Raises:
-            UnknownNameError: There is no route of that name.
+            UnknownNameError: There is no route with that name.
             SkyloopError: The file can't be read.
         """
         path = self._path(name)
@@ -48,7 +48,7 @@ class RouteFiles:
         return load_route(path)
 
     def save(self, name: str, route: Route) -> None:
-        """Write a route, replacing one of the same name.
+        """Write a route, replacing any with the same name.
 
         Raises:
             UsageError: The name is invalid, or the file can't be written.
@@ -67,7 +67,7 @@ class RouteFiles:
         """Delete a route.
 
         Raises:
-            UnknownNameError: There is no route of that name.
+            UnknownNameError: There is no route with that name.
             UsageError: The name is invalid, or the file can't be deleted.
         """
         path = self._path(name)
@@ -95,13 +95,13 @@ class RouteFiles:
 
 
 class CheckedRoutes:
-    """The last checked routes of one drone, by a hash of their content, so that only checked routes are flown."""
+    """One drone's most recently checked routes, by a hash of their content, so that only checked routes are flown."""
 
     def __init__(self) -> None:
         self._routes: OrderedDict[str, Route] = OrderedDict()
 
     def add(self, route: Route, check: RouteCheck) -> Json:
-        """Keep a route, and return the check's findings as JSON values, with the ``id`` to fly it by."""
+        """Keep a route; return the check's findings as JSON values, with the ``id`` by which to fly the route."""
         number = hashlib.sha256(checked(route).to_json()).hexdigest()[:16]
         self._routes[number] = route
         self._routes.move_to_end(number)
@@ -110,10 +110,10 @@ class CheckedRoutes:
         return {"id": number, "ok": check.ok, **msgspec.to_builtins(check)}
 
     def get(self, number: str) -> Route:
-        """Return a route.
+        """Return a checked route.
 
         Raises:
-            RefusedError: It was not checked, or too many others have been since.
+            RefusedError: The route was not checked, or too many others have been checked since.
         """
         if number not in self._routes:
             raise RefusedError("this route was not checked recently: check it again")

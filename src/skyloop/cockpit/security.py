@@ -1,13 +1,13 @@
-"""Decides which requests are answered, by the page they come from and the person who sent them. Guards every route.
+"""Decide which requests are answered, from the page they come from and the person who sent them. Guards all routes.
 
-A page from elsewhere can make a browser send requests here. Three checks stop it: the ``Host`` header must be this
-server's own (otherwise a foreign name was pointed at it: DNS rebinding); the ``Origin``, which browsers add to every
-WebSocket and to every request that changes something, and which pages can't forge, must be this page's (a link has
-none; there ``Sec-Fetch-Site`` shows its origin: it may lead to the page and nowhere else); and the page may load only
-its own files and can't be framed (Content-Security-Policy).
+A page from another site can make a browser send requests to this server. Three checks prevent that. The ``Host`` header
+must name this server (otherwise a foreign name was pointed at it: DNS rebinding). The ``Origin``, which browsers add to
+every WebSocket and every request that changes something, and which pages can't forge, must be that of this page; a link
+has no origin, but ``Sec-Fetch-Site`` shows where it comes from, and a foreign link may only lead to the page itself.
+Finally, the page may load only its own files and can't be framed (Content-Security-Policy).
 
-Then the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role for every route: by default
-an observer's, and a pilot's for routes that change something.
+After these checks the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
+needs: observer by default, pilot for routes that change something.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from skyloop.cockpit.access import Gate, Person, TokenGate, has_token
 from skyloop.errors import UsageError
 from skyloop.messages import Role
 
-LOG_IN: Final = 4401  #: close code of a WebSocket: not logged in
-NOT_ALLOWED: Final = 4403  #: close code: only a pilot may do this
-ADMIT: Final = "admit"  #: key in the connection's state; called with the person, returns why there is no place
-_FOREIGN: Final = 1008  # close code: a foreign page
-_LATER: Final = 1013  # close code: no place at present
+LOG_IN: Final = 4401  #: WebSocket close code: not logged in
+NOT_ALLOWED: Final = 4403  #: WebSocket close code: only a pilot may do this
+ADMIT: Final = "admit"  #: key in the connection's state of a function that returns why there is no place for a person
+_FOREIGN: Final = 1008  # close code: a page from another site
+_LATER: Final = 1013  # close code: currently no place
 
-#: Answered without a role: the page itself, and the routes for logging in.
+#: Answered whatever the role: the page itself, and the routes for logging in.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
 _ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")
-_OWN_SITE: Final = {"same-origin", "none"}  # none: typed by the person, or a bookmark
+_OWN_SITE: Final = {"same-origin", "none"}  # none: the address was typed or a bookmark opened
 _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
@@ -44,7 +44,7 @@ def bind_address(host: str) -> tuple[str, bool]:
     """Return the address to bind to, and whether it is a loopback address.
 
     Raises:
-        UsageError: It is not an address.
+        UsageError: The text is not an address.
     """
     if host == "localhost":
         return "127.0.0.1", True
@@ -62,8 +62,8 @@ def bind_address(host: str) -> tuple[str, bool]:
 class Names:
     """The values of ``Host`` that browsers send when they really mean this server.
 
-    ``any_address``: also accept any IP address with the right port, for a server that listens on all of the machine's
-    addresses: unlike a name, an address can't be pointed elsewhere.
+    ``any_address``: also accept any IP address with the right port, because the server listens on all of the machine's
+    addresses. Unlike a name, an address can't be pointed elsewhere.
     """
 
     exact: frozenset[str]
@@ -72,7 +72,7 @@ class Names:
     any_address: bool = False
 
     def own(self, host: str) -> bool:
-        """Return whether a value of ``Host``, in lower case, is this server's."""
+        """Return whether a lowercased ``Host`` value refers to this server."""
         if host in self.exact:
             return True
         found = _ADDRESS.fullmatch(host) if self.any_address else None
@@ -86,12 +86,12 @@ class Names:
 
 
 def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
-    """Return the names of a server.
+    """Return the names by which a server can be reached.
 
     Args:
         address: The address it listens on.
         port: The port it listens on.
-        more: Host names by which browsers reach it.
+        more: Further host names by which browsers reach it.
         scheme: ``http`` or ``https``.
     """
     known = ipaddress.ip_address(address)
@@ -105,7 +105,7 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
 
 
 def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names, path: str = "") -> str:
-    """Return why a request can't come from this page; empty if it may."""
+    """Return why a request can't come from this page; empty if it can."""
     given: dict[str, list[str]] = {"host": [], "origin": [], "sec-fetch-site": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
@@ -132,10 +132,10 @@ def needed(kind: str, method: str, path: str) -> Role | None:
 
 
 class Guard:
-    """ASGI middleware that decides which requests are answered, and adds the protective headers to every answer.
+    """ASGI middleware that decides which requests are answered, and adds protective headers to every answer.
 
-    It refuses requests by :func:`foreign` and :func:`needed`; others carry their sender in ``scope["person"]`` (None: a
-    stranger).
+    :func:`foreign` and :func:`needed` determine which requests it refuses; it stores the sender of all others in
+    ``scope["person"]`` (None: a stranger).
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
@@ -175,7 +175,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # A host that is not ours gets no answer that a browser would show.
+        # A host name that is not ours gets no answer that a browser would show.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (
@@ -185,20 +185,20 @@ class Guard:
 
 
 def person_of(scope: Scope) -> Person | None:
-    """Return who sent this request, as found by the guard."""
+    """Return who sent this request, as determined by the guard."""
     person: Person | None = scope["person"]
     return person
 
 
 async def gone_within(receive: Receive, within_s: float) -> bool:
-    """Wait until the client has disconnected.
+    """Wait for the client to disconnect.
 
     Args:
-        receive: The request's; other messages are dropped.
+        receive: The request's function of that name; other messages are dropped.
         within_s: How long to wait [s].
 
     Returns:
-        Whether it did so in time.
+        Whether the client disconnected in time.
     """
     try:
         async with asyncio.timeout(within_s):
@@ -210,12 +210,12 @@ async def gone_within(receive: Receive, within_s: float) -> bool:
 
 
 async def _connected() -> Message:
-    """Return the first message of a WebSocket again: it has already been received."""
+    """Return a WebSocket's first message, which has already been received."""
     return {"type": "websocket.connect"}
 
 
 def _everybody(_: Person | None) -> str:
-    """Admit everyone, if connections are not counted."""
+    """Admit everyone; used if connections are not counted."""
     return ""
 
 

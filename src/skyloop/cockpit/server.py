@@ -1,4 +1,4 @@
-"""Runs the cockpit: binds its address, finds drones and serves until stopped."""
+"""Run the cockpit: bind its address, find drones and serve the page until stopped."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ if TYPE_CHECKING:
 
 
 RECORDINGS = Path("recordings")  #: the default folder for recordings
-_LARGEST_MESSAGE = 4096  # bytes from a page
-_LOOK_S = 0.05  # between checks whether to stop
-_PING_S = 10.0  # a connection without an answer for this long is closed
+_LARGEST_MESSAGE = 4096  # maximum size of a message from a page [bytes]
+_LOOK_S = 0.05  # interval between checks whether to stop
+_PING_S = 10.0  # a connection that does not answer for this long is closed
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The people to admit, and their origin. By default: this user, on this machine, as a pilot.
+    """Whom to admit, and from where. By default: this user, on this machine, as a pilot.
 
-    ``host``: the address to listen on; one beyond loopback needs ``token_file``, ``client_ca`` or ``pair``.
-    ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's certificate and
-    key, for TLS. ``client_ca``: PEM file of the authority that signed the clients' certificates; their OU is the role.
-    ``role``: everyone's role, unless tokens or certificates decide it. ``hostnames``: names by which browsers reach
-    this machine if they don't use its address. ``pair``: admit, as ``role``, the first browser that opens the address
-    in the QR code shown; each code works once. ``page_authority``: PEM file of the authority that signed ``tls_cert``,
-    offered to browsers that should trust it.
+    ``host``: the address to listen on; any other than loopback needs ``token_file``, ``client_ca`` or ``pair``.
+    ``token_file``: lines of the form ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
+    certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the clients' certificates; their
+    OU is the role. ``role``: everyone's role, unless tokens or certificates decide it. ``hostnames``: names by which
+    browsers reach this machine if they don't use its address. ``pair``: admit, as ``role``, the first browser that
+    opens the address in the QR code shown; each code works once. ``page_authority``: PEM file of the authority that
+    signed ``tls_cert``, offered for browsers to trust.
 
     Raises:
-        UsageError: The options contradict one another.
+        UsageError: The options are contradictory.
     """
 
     host: str = "127.0.0.1"
@@ -85,7 +85,7 @@ class Access:
 
     @property
     def scheme(self) -> str:
-        """``http``, or ``https`` with TLS."""
+        """``https`` with TLS, otherwise ``http``."""
         return "http" if self.tls_cert is None else "https"
 
 
@@ -104,22 +104,22 @@ def serve_cockpit(
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) arrives.
 
     Args:
-        names: The drones to show; none: all, as they come and go.
+        names: The drones to show; if empty, all that are found at any time.
         port: The TCP port; 0 selects a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
             free one).
-        access: The people to admit, and their origin; by default this user, on this machine, as a pilot.
+        access: Whom to admit, and from where; by default this user, on this machine, as a pilot.
         recordings: The folder for recordings, created when needed.
-        on_ready: Called once on this thread with the page's address (default: print it, with a QR code if others reach
-          it and standard output is a terminal).
-        stop: Stops the server when set, from any thread.
-        network: Also show drones reachable over it.
-        world: File or name of a shipped world: the surroundings of drones that don't report them.
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: none.
+        on_ready: Called once on this thread with the page's address. By default the address is printed, with a QR code
+            if others can reach the page and standard output is a terminal.
+        stop: Stops the server when set from any thread.
+        network: Also show drones reachable over this network.
+        world: File or name of a shipped world, used as the surroundings of drones that don't report any.
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: no endpoint.
 
     Raises:
         UsageError: An address, port or file is invalid.
-        UnknownNameError: No proxy has a name in ``names``.
-        MissingExtraError: The extra ``cockpit``, or with ``metrics`` the extra ``metrics``, is not installed.
+        UnknownNameError: No proxy has one of the ``names``.
+        MissingExtraError: The extra ``cockpit`` or, with ``metrics``, the extra ``metrics`` is not installed.
     """
     try:
         import cv2  # noqa: F401
@@ -157,14 +157,14 @@ def serve_cockpit(
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
-    """Return the same access over https, with a certificate for this machine that is made or renewed as needed.
+    """Return the same access over https, with a certificate for this machine, which is created or renewed if necessary.
 
     Args:
-        access: Has no certificate.
-        directory: Holds certificates and their authority (:mod:`skyloop.network.keys.lab`).
+        access: Access without a certificate.
+        directory: Contains certificates and their authority (:mod:`skyloop.network.keys.lab`).
 
     Raises:
-        UsageError: There is already a certificate, the address can't be certified, or a file is invalid.
+        UsageError: The access already has a certificate, the address can't be certified, or a file is invalid.
         MissingExtraError: The extra ``network`` is not installed.
     """
     from skyloop.cockpit.security import bind_address
@@ -216,7 +216,7 @@ def _gate(access: Access, port: int) -> Gate:
         return CertificateGate()
     if access.token_file is not None or access.pair:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
-        cookie = f"skyloop-cockpit-{port}"  # browsers don't separate cookies by port
+        cookie = f"skyloop-cockpit-{port}"  # browsers share cookies between ports
         pairing = Pairing(access.role) if access.pair else None
         return TokenGate(tokens, cookie, pairing=pairing, kept=_session_file(cookie))
     if sys.platform != "linux":
@@ -235,7 +235,7 @@ def _session_file(cookie: str) -> SessionFile | None:
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()
-    with suppress(LinkError, OSError):  # then sessions last as long as this process, which logs that
+    with suppress(LinkError, OSError):  # otherwise sessions last only as long as this process, which logs that
         folder.create()
     return SessionFile(folder.path / f"{cookie}.sessions")
 
@@ -310,11 +310,11 @@ def _serve(
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
-    """Return a factory for the HTTP protocol of connections to a started server.
+    """Return a factory for the HTTP protocol of connections to a server that has started.
 
     Args:
         server: The server.
-        admission: Receives the progress of each connection.
+        admission: Informed about the progress of each connection.
         clock: The monotonic clock [ns].
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -323,10 +323,10 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
     from skyloop.cockpit.security import ADMIT
 
     class Protocol(H11Protocol):
-        """uvicorn's protocol, which also reports to the application and to the admission.
+        """uvicorn's protocol, which also informs the application and the admission.
 
-        The application gets the client's certificate, which uvicorn does not pass on; the admission learns about the
-        progress of the connection.
+        The application gets the client's certificate, which uvicorn does not pass on; the admission is informed about
+        the progress of the connection.
         """
 
         def __init__(self, connection: Connection) -> None:
@@ -335,7 +335,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self.client = self.client or (self._connection.address, 0)  # the client may have disconnected
+            self.client = self.client or (self._connection.address, 0)  # the client may already have disconnected
             self._connection.end = transport.abort
             tls = transport.get_extra_info("ssl_object")
             self.app_state = {
@@ -352,9 +352,9 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
 
 def quiet_server(app: Starlette) -> uvicorn.Server:
-    """Create a server for the cockpit that neither listens itself nor handles signals.
+    """Create a server for the cockpit that neither opens a listening socket nor handles signals.
 
-    uvicorn would raise the signals again at its end, which would cut the cockpit's own shutdown short.
+    uvicorn would raise the signals again when it ends, which would cut the cockpit's own shutdown short.
     """
     import uvicorn
 
@@ -369,13 +369,13 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
         log_level="warning",
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # trust the kernel for the client's address, not a header
+        proxy_headers=False,  # take the client's address from the kernel, not from a header
         ws_max_size=_LARGEST_MESSAGE,
         ws_ping_interval=_PING_S,
         ws_ping_timeout=_PING_S,
         ws_per_message_deflate=False,  # pictures are already compressed
         lifespan="on",
-        # Data that a stalled page leaves in buffers must not delay the end.
+        # Data left in the buffers of a stalled page must not delay shutdown.
         timeout_graceful_shutdown=2,
     )
     return QuietServer(config)
@@ -412,11 +412,11 @@ async def _run(
     await asyncio.gather(listening, return_exceptions=True)
     await serving
     if not listening.cancelled():
-        await listening  # raises what ended it
+        await listening  # raises the error that ended it
 
 
 def fleet_sources(fleet: Fleet) -> list[Source]:
-    """Return the current sources of metrics: one for each drone, and one for the fleet."""
+    """Return the current sources of metrics: one per drone, and one for the fleet."""
     stations = fleet.stations.copy()
     return [partial(_fleet_readings, fleet), *(partial(_readings, name, one) for name, one in stations.items())]
 

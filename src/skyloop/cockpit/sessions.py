@@ -1,7 +1,7 @@
-"""Sessions that outlive the cockpit's process, so that a page reconnects after a restart without a new log-in.
+"""Sessions that outlive the cockpit's process, so that after a restart a page reconnects without logging in again.
 
-They are kept in a file that only this user may read, beside the sockets of proxies. It holds hashes of cookies and
-tokens, which can't be used to log in, and is valid until the next reboot, because its times are on the monotonic clock.
+They are stored in a file that only this user may read, next to the proxies' sockets. It contains hashes of cookies and
+tokens, which can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Session(msgspec.Struct, frozen=True):
     """One log-in."""
 
     cookie: bytes  #: the cookie's hash
-    origin: bytes  #: hash of the token it was given for; empty: a pairing code
+    origin: bytes  #: hash of the token it was given for; empty if it was given for a pairing code
     role: Role
     name: str
-    until_ns: int  #: on the monotonic clock
+    until_ns: int  #: expiry on the monotonic clock
 
 
 class _Content(msgspec.Struct):
@@ -39,11 +39,11 @@ class _Content(msgspec.Struct):
 
 
 class SessionFile:
-    """The file with the sessions of one cockpit.
+    """The file that stores the sessions of one cockpit.
 
     Args:
-        path: The file; its folder may be missing.
-        boot: Identifies the machine's uptime since its last boot (default: the kernel's boot id).
+        path: The file; its folder need not exist.
+        boot: Identifies the current boot of the machine; by default the kernel's boot id.
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:
@@ -63,7 +63,7 @@ class SessionFile:
         return content.sessions if content is not None and self._boot and content.boot == self._boot else []
 
     def save(self, sessions: Iterable[Session]) -> None:
-        """Replace the file; on failure people only have to log in again after a restart."""
+        """Replace the file. If that fails, people only have to log in again after a restart."""
         new = self._path.with_name(f"{self._path.name}.new")
         try:
             with suppress(FileNotFoundError):

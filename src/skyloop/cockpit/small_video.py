@@ -1,6 +1,6 @@
-"""Small video of many drones for one page: over one socket, at a steady rate, in one message for all cameras.
+"""Small video streams of many drones for one page: one socket, at a steady rate, one message for all cameras.
 
-Otherwise a page that shows twelve drones would have twelve sockets, and would wake and paint for every frame.
+Otherwise a page that shows twelve drones would need twelve sockets, and would wake up and paint for every frame.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
-SEND_HZ: Final = 60.0  #: messages per second, at most
-GATHER_S: Final = 0.005  #: how long a picture waits for other cameras', which often arrive together
-MAX_SHOWN: Final = 64  #: cameras shown on one page at a time
+SEND_HZ: Final = 60.0  #: maximum number of messages per second
+GATHER_S: Final = 0.005  #: time that a picture waits for those of other cameras, which often arrive together
+MAX_SHOWN: Final = 64  #: maximum number of cameras shown on one page at a time
 _BAD_MESSAGE: Final = 1008
 
 
@@ -42,8 +42,8 @@ class _Place(msgspec.Struct, frozen=True):
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
     """A message from a page.
 
-    It starts to show a camera (``width`` pixels wide, ``h264`` if it decodes that) or stops; it can't decode a camera's
-    pictures until the next ``key``; or it acknowledges what it drew.
+    The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes that) or stops; it can't decode a
+    camera's pictures until the next ``key``; or it acknowledges what it has drawn.
     """
 
     show: _Place | None = None
@@ -63,12 +63,12 @@ class _Shown:
     station: Station | None = None
     stream: PageStream | None = None
     feed: SmallFeed | None = None
-    sent: int = 0  #: serial of the last JPEG sent
+    sent: int = 0  #: serial number of the last JPEG sent
 
     def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
-        """Subscribe to the camera, and again after the drone came back or was replaced.
+        """Subscribe to the camera; also called after the drone was reconnected or replaced.
 
-        JPEGs are subscribed only while nothing else is shown.
+        JPEGs are subscribed to only while nothing else is shown.
         """
         if station is not self.station:
             self.release()
@@ -105,8 +105,8 @@ class _Shown:
 class SmallVideoSender:
     """Sends one page the newest frame of each camera it shows, in one message, until the page disconnects.
 
-    The next message is sent once the page has drawn the previous one: a slow page gets fewer frames, never older ones,
-    and delays no other page.
+    The next message is sent once the page has drawn the previous one, so a slow page gets fewer frames, but never older
+    ones, and does not delay other pages.
     """
 
     def __init__(self, socket: WebSocket, stations: Mapping[str, Station], counts: PageCounts) -> None:
@@ -160,7 +160,7 @@ class SmallVideoSender:
         self._counts.frames_sent += len(heads)
 
     def _pictures(self, shown: _Shown) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """Yield the unsent pictures of a camera with their data; several of H.264, which depend on one another."""
+        """Yield a camera's unsent pictures with their data; several if they are H.264, which depend on one another."""
         stream, feed, station = shown.stream, shown.feed, shown.station
         if station is None:
             return
@@ -191,7 +191,7 @@ class SmallVideoSender:
             self._problem = self._handle(message.get("text") or "")
 
     def _handle(self, text: str) -> str:
-        """Handle a message; return its problem, empty if valid."""
+        """Handle a message; return its problem, or an empty string if it is valid."""
         try:
             message = msgspec.json.decode(text, type=_Message)
         except msgspec.DecodeError as error:

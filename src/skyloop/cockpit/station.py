@@ -1,4 +1,4 @@
-"""One drone of the cockpit: the state shared by its pages, and each page's own connection for flying it."""
+"""One drone in the cockpit: the state that its pages share, and each page's own connection for flying it."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
-FRESH_S: Final = 0.2  #: time limit for fresh feedback
+FRESH_S: Final = 0.2  #: time limit for fresh feedback to arrive
 PILOT_S: Final = 2.0  #: time limit for opening a pilot's connection
-RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recordings
-SHOWN_S: Final = 8.0  #: time limit for the vehicle to show stopped motors; the stop is repeated as long
-STOPPER: Final = "cockpit stop"  #: the application that sends emergency stops, and nothing else
-RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
+RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recorded drones
+SHOWN_S: Final = 8.0  #: time for the vehicle to show stopped motors; the stop is repeated for as long
+STOPPER: Final = "cockpit stop"  #: name of the application that sends emergency stops, and nothing else
+RETRY_S: Final = 0.05  #: pause between attempts to send an emergency stop
 _log = logging.getLogger(__name__)
 
 
 class PilotConnection(Drone):
-    """A pilot's connection that requests the authority in :meth:`acquire`, not when it is opened.
+    """A pilot's connection that requests the authority in :meth:`acquire` rather than when it is opened.
 
-    Without the authority it can only stop the motors in an emergency.
+    Without the authority, all it can do is stop the motors in an emergency.
     """
 
     _newest: tuple[AnyAction, int] = Idle(), 0  # the last :meth:`command` and its number
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
-        """Connect, without the authority.
+        """Connect without requesting the authority.
 
         Args:
             dial: Opens a new connection to the proxy on each call.
@@ -60,11 +60,11 @@ class PilotConnection(Drone):
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
-        """Repeat commands only while the page is known to be present, because a person flies through it."""
+        """Repeat commands only while the page is known to be present, because a person flies with it."""
         commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
-        """Count the page as present until this time of the process's monotonic clock, and then as silent."""
+        """Treat the page as present until this time on the process's monotonic clock, and as silent afterwards."""
         commands(self).present_until(until_ns)
 
     @property
@@ -74,7 +74,7 @@ class PilotConnection(Drone):
 
     @property
     def is_linked(self) -> bool:
-        """Whether there is a connection to the proxy now."""
+        """Whether there is currently a connection to the proxy."""
         return self.link.application in (LinkState.UP, LinkState.DEGRADED)
 
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
@@ -85,18 +85,18 @@ class PilotConnection(Drone):
             ask: Ask the holder first, and wait in the queue instead of failing.
 
         Raises:
-            AuthorityError: Another application holds it; the message names that application.
+            AuthorityError: Another application holds the authority; the message names it.
         """
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer a request for the authority, and wait until the proxy has the answer.
+        """Answer a request for the authority and wait until the proxy has received the answer.
 
         Args:
-            lease: The lease under which this connection holds the authority.
+            lease: The lease by which this connection holds the authority.
             app_id: The application that asked.
             grant: Whether to hand the authority over.
-            reason: The reason for a refusal, shown to a person.
+            reason: The reason for a refusal, shown to the person who asked.
 
         Raises:
             RefusedError: This connection no longer holds the authority.
@@ -116,7 +116,7 @@ class PilotConnection(Drone):
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
-        """Whether a failsafe, a lost link or a lost lease ended this action, and it could be sent again now."""
+        """Whether a failsafe, a lost link or a lost lease ended this action, and it could now be sent again."""
         newest, intent = self._newest
         outcome = commands(self).outcome(intent) if newest is action else None
         return outcome is not None and outcome.fate in OVERRULED and commands(self).may_ask
@@ -127,7 +127,7 @@ class PilotConnection(Drone):
         return commands(self).intent
 
     def refusal(self, first: int) -> Outcome | None:
-        """The first command from this number on that the proxy refused or ended; None except for :meth:`has_ended`."""
+        """The first command from this number on that was refused or ended, unless :meth:`has_ended` covers it."""
         told = commands(self).told
         if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
             return None
@@ -135,13 +135,13 @@ class PilotConnection(Drone):
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether the proxy reports the fate of the newest command, so it has arrived there."""
+        """Whether the proxy reports what became of the newest command, which proves that it arrived."""
         newest, (_, intent) = Known(self).newest, self._newest
         outcome = None if newest is None else newest.outcome
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover or land because the cockpit has to, not a person; see :func:`skyloop.extend.let_go`."""
+        """Hover or land because the cockpit, not a person, has to; see :func:`skyloop.extend.let_go`."""
         return let_go(self, reason, land=land)
 
     @property
@@ -156,7 +156,7 @@ class PilotConnection(Drone):
 class FlyingSession(Protocol):
     """A page's control of the drone."""
 
-    app: str  #: the name that other applications see
+    app: str  #: the name shown to other applications
 
     @property
     def waits(self) -> bool:
@@ -166,15 +166,15 @@ class FlyingSession(Protocol):
         """Send no more commands."""
 
     def let_go(self, why: str) -> None:
-        """Hover, if the page has the vehicle under way."""
+        """Hover if the vehicle is under way because of this page."""
 
 
 class Station:
-    """One drone, with the state shared by its pages. Created and closed on the event loop.
+    """One drone and the state that its pages share. Created and closed on the event loop.
 
     Args:
         found: The address of the proxy.
-        drone: Connected as an observer; closed by :meth:`close`.
+        drone: The drone, connected as an observer; closed by :meth:`close`.
     """
 
     def __init__(self, found: Found, drone: Drone) -> None:
@@ -185,29 +185,29 @@ class Station:
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
         self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
-        self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by application name
+        self.goals: dict[str, Waypoint] = {}  #: where pages fly the drone to, by application name
         self.routes = CheckedRoutes()
-        self.sessions: set[FlyingSession] = set()  #: of pages that may fly it
-        self.pilots: set[PilotConnection] = set()  #: the pages' connections for pilots
+        self.sessions: set[FlyingSession] = set()  #: sessions of pages that may fly it
+        self.pilots: set[PilotConnection] = set()  #: pages' connections for flying
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
         drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # registered until the drone is closed
-        self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows the drone
+        self._whole: Cancellable | None = None  # consumes all feedback while a page shows the drone
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
-        self._stops = 0  # emergency stops under way
-        self._names: list[str] = []  # unused subscriber names for streams to one page
+        self._stops = 0  # number of emergency stops in progress
+        self._names: list[str] = []  # unused subscriber names for streams to a single page
         self._named = 0
 
     @property
     def flies(self) -> bool:
-        """Whether there is a vehicle to fly: a recording accepts every command without effect."""
+        """Whether there is a vehicle to fly; a recording accepts every command, but without effect."""
         return bool(self.drone.capabilities.actions) and not self.drone.uri.startswith(RECORDINGS)
 
     @property
     def in_use(self) -> bool:
-        """Whether a page shows it."""
+        """Whether a page shows the drone."""
         return self.broadcast.wanted or any(feed.wanted for feed in self.feeds)
 
     @property
@@ -216,59 +216,59 @@ class Station:
         return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
     def camera(self, name: str) -> CameraFeed | None:
-        """Return the feed of a camera; None if the vehicle has no such camera."""
+        """Return a camera's feed, or None if the vehicle has no such camera."""
         if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
 
     def small_video(self, name: str, width: int) -> SmallFeed | None:
-        """Return the feed of a camera scaled down to a width [pixels]; None if the vehicle has no such camera."""
+        """Return a camera's feed scaled down to a width [pixels], or None if the vehicle has no such camera."""
         camera = next((info for info in self.drone.capabilities.cameras if info.name == name), None)
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
 
     def encoded(self, name: str, form: Form) -> EncodedFeed:
-        """Return the feed of a camera's H.264 in one form; :meth:`forget` it once no page shows it."""
+        """Return the feed of a camera's H.264 in one form; call :meth:`forget` once no page shows it."""
         if (name, form) not in self.streams:
             self.streams[name, form] = EncodedFeed(self.drone, name, form)
         return self.streams[name, form]
 
     def forget(self, feed: EncodedFeed) -> None:
-        """Forget a feed that no page shows."""
+        """Forget a feed that no page shows any more."""
         self.streams.pop((feed.camera, feed.form), None)
 
     def own_name(self) -> str:
-        """Return a subscriber's name for a stream to one page; :meth:`free_name` makes it available again."""
+        """Return a subscriber name for a stream to one page; :meth:`free_name` makes it available again."""
         if not self._names:
             self._named += 1
             self._names.append(f"{secrets.token_hex(6)}-{self._named}")
         return self._names.pop()
 
     def free_name(self, name: str) -> None:
-        """Return a name from :meth:`own_name`."""
+        """Release a name from :meth:`own_name`."""
         self._names.append(name)
 
     def feedback(self) -> Feedback:
-        """Return the newest feedback, which arrives slowly while pages show only the drone's row.
+        """Return the newest feedback, which arrives at a low rate while pages show only the drone's row.
 
         Raises:
-            LinkError: There is none, or the drone was closed.
+            LinkError: There is no feedback, or the drone was closed.
         """
         return self.drone.feedback(max_hz=ROW_HZ)
 
     def fresh_feedback(self) -> Feedback:
-        """Wait for a state captured from now on: the newest feedback may predate a take-off.
+        """Wait for a state captured from now on, because the newest feedback may predate a take-off.
 
         Raises:
-            LinkError: None arrives within :data:`FRESH_S`.
+            LinkError: No feedback arrives within :data:`FRESH_S`.
         """
         now_ns = self.drone.now_ns
         return self.drone.wait(lambda feedback: feedback.captured_ns >= now_ns, FRESH_S)
 
     @property
     def feedback_period_s(self) -> float:
-        """The requested time between two samples of feedback [s]; 0 for all samples."""
+        """The requested interval between feedback samples [s]; 0 for all samples."""
         return 1.0 / ROW_HZ if self._whole is None else 0.0
 
     def _on_shown(self, shown: bool) -> None:
@@ -283,7 +283,7 @@ class Station:
     # Pilots ----------------------------------------------------------------------------------------------------
 
     async def open_pilot(self, app: str) -> PilotConnection:
-        """Open a pilot's connection that holds nothing yet.
+        """Open a pilot's connection that does not hold the authority yet.
 
         Args:
             app: The name to connect under.
@@ -305,7 +305,7 @@ class Station:
         self.pilots.discard(pilot)
 
     def pilot_came(self) -> None:
-        """Prepare the connection for emergency stops for a page that may stop the motors."""
+        """Prepare the connection for emergency stops, for a page that may stop the motors."""
         self._may_stop += 1
         if self._stopper is None:
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
@@ -329,15 +329,15 @@ class Station:
         return await asyncio.shield(self._stopper)
 
     async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
-        """Stop the motors, over a connection used for nothing else; no page flies the vehicle meanwhile.
+        """Stop the motors over a connection used for nothing else, during which no page flies the vehicle.
 
         Args:
-            until_ns: Latest time for sending it first, on this process's monotonic clock.
-            sent: Called when it was sent.
+            until_ns: Latest time to send the stop for the first time, on this process's monotonic clock.
+            sent: Called when the stop was sent.
 
         Raises:
-            LinkError: It was not sent, and never will be.
-            NoAnswerError: The vehicle does not show stopped motors within :data:`SHOWN_S`.
+            LinkError: The stop was not sent, and never will be.
+            NoAnswerError: The vehicle does not report stopped motors within :data:`SHOWN_S`.
             UnsupportedError: The vehicle has no emergency stop.
         """
         self._stops += 1
@@ -351,14 +351,14 @@ class Station:
             sent()
             await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
         except SkyloopError:
-            for session in self.sessions:  # their flights are not resumed
+            for session in self.sessions:  # their flights must not be resumed
                 session.let_go("the vehicle does not show the emergency stop")
             raise
         finally:
             self._stops -= 1
 
     def check_stop(self) -> None:
-        """Raise :class:`RefusedError` while an emergency stop is under way and the vehicle does not show it yet."""
+        """Raise :class:`RefusedError` while an emergency stop is in progress that the vehicle does not show yet."""
         if self._stops:
             raise RefusedError("an emergency stop is under way: other commands wait until the vehicle shows it")
 
@@ -373,7 +373,7 @@ class Station:
                     return stopper
                 why = f"the link to the proxy is {stopper.link.application}"
                 with suppress(SkyloopError):
-                    stopper.idle()  # or it would be sent whenever the link comes back: this loop retries instead
+                    stopper.idle()  # or it would be sent whenever the link is restored: this loop retries instead
             except LinkError as error:
                 why = str(error)
             except TimeoutError:
@@ -423,6 +423,6 @@ def _nothing(_: Feedback) -> None:
 
 
 def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:
-    """Ignore the error: it is raised for the next emergency stop, which tries again."""
+    """Ignore the error: the next emergency stop tries again and raises it."""
     if not task.cancelled():
         task.exception()

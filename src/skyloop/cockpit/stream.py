@@ -1,8 +1,8 @@
-"""Sends data to pages: one object per open socket. A page that does not keep up gets less, never anything older.
+"""Send data to pages, with one object per open socket. A page that does not keep up gets less data, never older data.
 
-Video: one JPEG is on its way at a time; the page acknowledges it after drawing it, and only then gets the newest. Of
-H.264, whose pictures depend on one another, several are; a page that skips one resumes at a key picture.
-Telemetry: the newest state about 20 times a second, as fast as the socket accepts it; made once for all pages.
+Video: only one JPEG is in flight at a time; the page gets the newest one after it has drawn and acknowledged the last.
+Several H.264 pictures are in flight, because they depend on one another; a page that skips one resumes at a key one.
+Telemetry: the newest state about 20 times a second, or as fast as the socket accepts it, created once for all pages.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from skyloop.cockpit.page_stream import PageStream, Sent
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 
-DRAWN_BYTES = 65_536  #: of drawings sent to a page with one frame: about the size of the frame itself
-MAX_WAITING: Final = 256  #: queued answers to a page that does not read; further ones are dropped
-MAX_COUNTED = 256  #: sources of drawings named in the counts
+DRAWN_BYTES = 65_536  #: maximum size of drawings sent to a page with one frame: about the size of the frame itself
+MAX_WAITING: Final = 256  #: answers queued for a page that does not read; further ones are dropped
+MAX_COUNTED = 256  #: maximum number of sources of drawings listed in the counts
 
 _BAD_MESSAGE = 1008
 _LOOK_S: Final = 0.2
-UNKNOWN = 4404  #: close code: no such drone or camera
+UNKNOWN = 4404  #: close code: there is no such drone or camera
 
 
 @dataclass(slots=True)
 class PageCounts:
-    """Counts over all pages since the start."""
+    """Counts for all pages since the start."""
 
-    pages: int = 0  #: open now
+    pages: int = 0  #: number of pages currently open
     frames_sent: int = 0
     frames_acknowledged: int = 0
-    frames_skipped: int = 0  #: not sent because the page was still drawing
-    sources: set[str] = field(default_factory=set)  #: of drawings sent
+    frames_skipped: int = 0  #: not sent because the page was still drawing the previous one
+    sources: set[str] = field(default_factory=set)  #: sources of the drawings sent
 
 
 class VideoSender:
-    """Sends one camera to one page until it disconnects: as JPEGs, or as H.264 if the page decodes that."""
+    """Sends one camera to one page until it disconnects, as H.264 if the page can decode that, otherwise as JPEGs."""
 
     def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
@@ -53,13 +53,13 @@ class VideoSender:
         self._event_feed = station.event_feed
         self._counts = counts
         self._wake = asyncio.Event()
-        self._stream: PageStream | None = None  # for a page that decodes H.264
-        self._as_jpeg = False  # JPEGs are subscribed to
+        self._stream: PageStream | None = None  # set if the page decodes H.264
+        self._as_jpeg = False  # whether JPEGs are subscribed to
         self._number = 0  # number of the last message
-        self._sent = 0  # serial of the last JPEG sent; not the frame, which would keep its memory from the proxy
+        self._sent = 0  # number of the last JPEG sent; not the frame, which would keep its memory from the proxy
         self._sent_ns = 0  # capture time of the last picture sent
-        self._waiting = 0  # number of the JPEG that is not yet acknowledged
-        self._drawn: dict[str, int] = {}  # capture time of the newest drawing sent, by source; the last sent comes last
+        self._waiting = 0  # number of the JPEG not yet acknowledged
+        self._drawn: dict[str, int] = {}  # capture time of the newest drawing sent, by source; latest last
 
     async def run(self) -> None:
         """Send until the page disconnects."""
@@ -90,7 +90,7 @@ class VideoSender:
             await asyncio.gather(receiver, return_exceptions=True)
 
     def _choose(self) -> None:
-        """Subscribe to JPEGs while the page is shown nothing else."""
+        """Subscribe to JPEGs while nothing else is shown to the page."""
         as_jpeg = self._stream is None or not self._stream.shows
         if as_jpeg != self._as_jpeg:
             self._as_jpeg = as_jpeg
@@ -99,7 +99,7 @@ class VideoSender:
             self._wake.set()
 
     async def _receive(self) -> bool:
-        """Receive acknowledgements until the page disconnects (True) or sends something else (False)."""
+        """Receive acknowledgements until the page disconnects (True) or sends anything else (False)."""
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -171,10 +171,10 @@ class VideoSender:
         self._counts.frames_skipped += skipped
 
     async def _send_drawings(self) -> None:
-        """Send drawings for the frame sent last or earlier ones, so that there are never more of them than of frames.
+        """Send drawings for the last frame sent or earlier ones, so that there are never more drawings than frames.
 
-        At most :data:`DRAWN_BYTES` are sent with each frame, in pieces, those sent longest ago first: many sources
-        delay neither this page's pictures nor other pages.
+        At most :data:`DRAWN_BYTES` are sent with each frame, in pieces, starting with the sources sent longest ago, so
+        that many sources delay neither this page's pictures nor other pages.
         """
         newest = self._event_feed.drawings.items()
         drawings = {source: one for (camera, source), one in newest if camera == self._feed.camera}
@@ -188,7 +188,7 @@ class VideoSender:
             text = drawings[source].text
             left -= len(text)
             if left < 0 and left + len(text) < DRAWN_BYTES:
-                break  # the rest follows with the next frame; a drawing over the limit is sent alone
+                break  # the rest is sent with the next frame; a drawing that exceeds the limit is sent alone
             self._drawn.pop(source, None)
             self._drawn[source] = captured
             if len(self._counts.sources) < MAX_COUNTED:
@@ -232,18 +232,18 @@ class BroadcastSender:
         await self._socket.send_text(self._broadcast.message.decode())
 
     async def _until_gone(self) -> str:
-        """Return the type of the next message: none are expected from the page here."""
+        """Return the type of the next message; here, the page is not expected to send any."""
         return str((await self._socket.receive())["type"])
 
 
 class TelemetrySender(BroadcastSender):
-    """Sends a drone's state and events, preceded by the vehicle whenever it changes."""
+    """Sends a drone's state and events, preceded by a description of the vehicle whenever that changes."""
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
         super().__init__(socket, station.broadcast)
         self._station = station
         self._vehicle: dict[str, Any] | None = None
-        self._last_event = 0  # number of the last event
+        self._last_event = 0  # number of the last event sent
 
     async def _send(self) -> None:
         view = self._station.view
@@ -258,7 +258,7 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page, and passes on its commands. On the event loop."""
+    """Sends messages to one page and passes on its commands. On the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
@@ -272,7 +272,7 @@ class PageSocket:
     async def serve(self, handle: Callable[[Sequence[str | bytes]], None]) -> None:
         """Call ``handle`` with the messages received since the last call, oldest first, until the page disconnects.
 
-        After a pause of this process there are several: the newest is known before the oldest acts.
+        If this process was suspended, there may be several: the newest is known before the oldest takes effect.
         """
         came: list[str | bytes] = []
         some = asyncio.Event()
@@ -281,7 +281,7 @@ class PageSocket:
             with suppress(WebSocketDisconnect):
                 while (message := await self._socket.receive())["type"] != "websocket.disconnect":
                     came.append(message.get("text") or message.get("bytes") or "")
-                    some.set()  # messages already here are received without a turn of the loop
+                    some.set()  # messages that have already arrived are received without a turn of the loop
 
         reading, writing = asyncio.create_task(read()), asyncio.create_task(self._write())
         reading.add_done_callback(lambda _: some.set())
@@ -297,13 +297,13 @@ class PageSocket:
             writing.cancel()
 
     async def _write(self) -> None:
-        with suppress(WebSocketDisconnect):  # the receiving side also detects it
+        with suppress(WebSocketDisconnect):  # the receiving side notices this as well
             while True:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 
 
 class _FromPage(msgspec.Struct):
-    """A page's message: drawn pictures, accepted kinds of pictures, or a picture it can't decode."""
+    """A message from a page: drawn pictures, accepted kinds of pictures, or a picture it can't decode."""
 
     ack: int | None = None
     h264: bool | None = None
@@ -312,7 +312,7 @@ class _FromPage(msgspec.Struct):
 
 
 def _said(text: str) -> _FromPage | None:
-    """Decode a page's message; None if it is invalid."""
+    """Decode a page's message; return None if it is invalid."""
     try:
         said = msgspec.json.decode(text, type=_FromPage)
     except msgspec.DecodeError:
@@ -321,7 +321,7 @@ def _said(text: str) -> _FromPage | None:
 
 
 class Captured(Protocol):
-    """The part of a picture that pages learn about."""
+    """The part of a picture that pages are told about."""
 
     @property
     def seq(self) -> int: ...
@@ -331,11 +331,11 @@ class Captured(Protocol):
 
 def picture_values(picture: Captured, age_s: float, width: int, height: int) -> dict[str, Any]:
     """Return a picture's description for pages, as JSON values."""
-    captured = str(picture.captured_ns)  # too large for JavaScript's numbers
+    captured = str(picture.captured_ns)  # too large for numbers in JavaScript
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 
 
 def encoding_values(one: Sent) -> dict[str, Any]:
-    """Return how a picture is encoded as JSON values for a page."""
+    """Return how a picture is encoded, as JSON values for a page."""
     values = {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}
     return values | {"late": True} if one.form.subscriber and one.late_here else values

@@ -1,4 +1,4 @@
-"""The authority as a page sees it: its holder, its loss, requests for it, and the page's place in the queue.
+"""The authority as seen by a page: its holder, its loss, requests for it, and the page's place in the queue.
 
 :class:`TakeoverQuestions` and :class:`QueueTracker` are pure, with the time as an argument; :class:`TakeoverDialog`
 connects them to one page, and :class:`AuthorityReport` reports changes.
@@ -27,11 +27,11 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuestion:
-    """Another application asks for the authority that this page holds."""
+    """A question from another application that wants the authority held by this page."""
 
     query: TakeoverQuery
     until_ns: int  #: when the question expires, on the proxy's clock
-    declined: bool = False  #: by this page; a higher priority gets it anyway when the question expires
+    declined: bool = False  #: by this page; a higher priority still gets the authority when the question expires
 
     def to_json(self, now_ns: int) -> Json:
         """Return the question as JSON values; ``now_ns`` is the proxy's clock."""
@@ -46,20 +46,20 @@ class TakeoverQuestion:
 
 
 class TakeoverQuestions:
-    """The open questions to a page, by the asking application's number. Times are on the proxy's clock.
+    """A page's open questions, keyed by the number of the asking application. Times are on the proxy's clock.
 
-    Methods that change them return whether anything changed.
+    Methods that may change them return whether anything changed.
     """
 
     def __init__(self) -> None:
         self._open: dict[int, TakeoverQuestion] = {}
 
     def find(self, by_id: int) -> TakeoverQuestion | None:
-        """Return the question of an application, None if it asks nothing."""
+        """Return an application's question, or None if it asks nothing."""
         return self._open.get(by_id)
 
     def on_event(self, event: Event, app_id: int) -> bool:
-        """Handle an event, as the application with this number."""
+        """Handle an event as the application with this number."""
         if event.kind is EventKind.AUTHORITY_WITHDRAWN and event.data.get("app_id") == app_id:
             by_id = event.data.get("by_id")
             return isinstance(by_id, int) and self._open.pop(by_id, None) is not None
@@ -78,13 +78,13 @@ class TakeoverQuestions:
         return True
 
     def update(self, lease: int, now_ns: int) -> bool:
-        """Drop the questions about another lease, and expired ones."""
+        """Drop expired questions and those about another lease."""
         left = {by_id: one for by_id, one in self._open.items() if one.query.lease == lease and now_ns < one.until_ns}
         changed, self._open = len(left) != len(self._open), left
         return changed
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the message to the page; the application next in line for the authority comes first."""
+        """Return the message for the page; the application that gets the authority next comes first."""
         ordered = sorted(self._open.values(), key=lambda one: (one.query.request.priority, one.until_ns))
         return {"type": "asked", "questions": [one.to_json(now_ns) for one in ordered]}
 
@@ -95,8 +95,8 @@ class QueuePosition:
 
     position: int | None  #: 1 is next; None: unknown
     until_ns: int | None  #: when its turn is expected; None: unknown
-    asked: bool  #: the holder was asked first
-    declined: str | None  #: the holder's reason for keeping it, which may be empty
+    asked: bool  #: whether the holder was asked first
+    declined: str | None  #: the holder's reason for keeping it, which may be empty; None if it did not decline
 
     def to_json(self, now_ns: int) -> Json:
         """Return the position as JSON values; ``now_ns`` is the monotonic clock."""
@@ -105,12 +105,12 @@ class QueuePosition:
 
 
 class QueueTracker:
-    """Tracks a page's position in the queue, and the answer to its question."""
+    """Tracks a page's position in the queue and the answer to its question."""
 
     def __init__(self) -> None:
         self._asked = False
         self._declined: str | None = None
-        self._known: tuple[int, float | None] | None = None  # position and time in the newest status
+        self._known: tuple[int, float | None] | None = None  # position and time from the newest status
         self._until_ns: int | None = None
 
     def request(self, *, ask: bool) -> None:
@@ -118,17 +118,17 @@ class QueueTracker:
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
-        """Handle an event, as the application with this number."""
+        """Handle an event as the application with this number."""
         if event.kind is EventKind.AUTHORITY_DECLINED and event.data.get("app_id") == app_id:
             self._declined = str(event.data.get("reason", ""))
 
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
-        """Return the position in the queue.
+        """Return the page's position in the queue.
 
         Returns:
-            None if the page does not wait. Equal to the previous one until the status changes.
+            None if the page does not wait. Otherwise equal to the previous result until the status changes.
         """
-        if status.state == "held":  # a pilot overruled later gets it back without asking
+        if status.state == "held":  # a pilot that was overruled later gets the authority back without asking
             self.request(ask=False)
         if status.state not in ("queued", "preempted"):
             return None
@@ -141,7 +141,7 @@ class QueueTracker:
 
 
 class TakeoverDialog:
-    """Both sides of a takeover for one page. On the event loop.
+    """Handles both sides of a takeover for one page. On the event loop.
 
     Args:
         send: Sends a message to the page.
@@ -205,23 +205,23 @@ class AuthorityReport:
         #: waits.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None, list[str]] | None = None
         self._was_mine = False
-        self._given, self._given_ns = False, 0  # handed over on request, and when
-        self._loss: str | None = None  # how this page lost its control; None: it did not
+        self._given, self._given_ns = False, 0  # whether and when it was handed over on request
+        self._loss: str | None = None  # how this page lost control; None if it did not
 
     def released(self) -> None:
-        """Treat the loss of control as intended: the page released it."""
+        """Treat the loss of control as intended, because the page released it."""
         self._was_mine, self._loss = False, None
 
     def handed_over(self, *, given: bool = True) -> None:
-        """Treat the coming loss of control as a handover, or undo that with ``given=False``."""
+        """Treat the coming loss of control as a handover; ``given=False`` undoes that."""
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
-        """Return the message for the page; None if nothing has changed.
+        """Return the message for the page, or None if nothing has changed.
 
         Args:
-            pilot: The page's own connection, if it has one.
-            place: The page's position in the queue, while it waits.
+            pilot: The page's own connection, if any.
+            place: The page's position in the queue while it waits.
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
@@ -234,7 +234,7 @@ class AuthorityReport:
             holder, priority = None, None
         mine = state == "held"
         lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
-        if lost or (holder == self._app and not mine):  # left over from before
+        if lost or (holder == self._app and not mine):  # left over from earlier
             holder = None
         if holder is None:
             priority = None
@@ -243,7 +243,7 @@ class AuthorityReport:
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
         if mine != self._was_mine and (mine or monotonic_ns() - self._given_ns > nanoseconds(GIVEN_S)):
-            self._given = False  # the handover was at another time, or the applicant did not accept
+            self._given = False  # the handover was at another time, or the other application did not accept
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         waiting = sorted(session.app for session in self._station.sessions if session.waits)
@@ -276,7 +276,7 @@ class AuthorityReport:
         return held is None or priority < held
 
     def busy(self, priority: int) -> str:
-        """Return in words why a priority can't take control."""
+        """Return in words why a given priority can't take control."""
         try:
             feedback = self._station.feedback()
         except LinkError:
@@ -288,7 +288,7 @@ class AuthorityReport:
         )
 
     def _why(self, ended: str, holder: str | None, lost: bool) -> str:
-        """Return what happened to the page's control, in words that are true now."""
+        """Return in words what happened to the page's control, as it is true now."""
         name = self._station.found.name
         now = f"{holder} has control" if holder else "nobody has control"
         if ended == "link" and lost:

@@ -1,8 +1,8 @@
-"""Keeps frames while a person draws a box, and tracks its content from that frame on, on separate threads.
+"""Keep frames while a person draws a box, and track its content from that frame on, on separate threads.
 
-Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is called
-on one other thread only: it first catches up frame by frame, then processes the newest frame each time, and makes a
-set-point after each frame and at least every :data:`PERIOD_S`.
+Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is only
+called on one other thread. It first catches up frame by frame, then always processes the newest frame. It computes a
+set-point after each frame, and at least every :data:`PERIOD_S`.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from skyloop.messages.relayed import Shape
     from skyloop.vision import Detection
 
-KEPT_S: Final = 3.0  #: a box on an older picture is refused and must be drawn again
+KEPT_S: Final = 3.0  #: a box drawn on an older picture is refused and must be drawn again
 KEPT_BYTES: Final = 64 * 1024 * 1024
-#: While catching up, a tracker takes the newest frame that is at most this far from the previous one.
+#: While catching up, a tracker uses the newest frame that is at most this much later than the previous one.
 STRIDE_S: Final = 0.07
 
 _KEPT_NS: Final = nanoseconds(KEPT_S)
 _STRIDE_NS: Final = nanoseconds(STRIDE_S)
-PERIOD_S: Final = 0.05  #: between two set-points without a new frame
-SOURCE: Final = "follow"  #: of the drawings
+PERIOD_S: Final = 0.05  #: interval between set-points if there is no new frame
+SOURCE: Final = "follow"  #: source of the drawings
 
 
 class KeptFrames:
-    """Frames as JPEGs, ordered by capture, the newest :data:`KEPT_S` or :data:`KEPT_BYTES` of them."""
+    """Frames as JPEGs, ordered by capture time: the newest :data:`KEPT_S` or :data:`KEPT_BYTES` of them."""
 
     def __init__(self, most_bytes: int = KEPT_BYTES) -> None:
-        """Keep at most ``most_bytes`` of frames; none yet."""
-        self.bytes = 0  #: of all frames kept
+        """Initialise without frames, to keep at most ``most_bytes`` of them."""
+        self.bytes = 0  #: size of all frames kept
         self._most_bytes = most_bytes
         self._frames: deque[Arrival] = deque()
 
@@ -55,7 +55,7 @@ class KeptFrames:
         return len(self._frames)
 
     def add(self, arrival: Arrival) -> None:
-        """Add a frame; one captured before the newest (by a restarted proxy) discards the others."""
+        """Add a frame. If it was captured before the newest one (the proxy restarted), discard the others."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
         self._frames.append(arrival)
@@ -75,7 +75,7 @@ class KeptFrames:
         """Return the frame with this capture time.
 
         Raises:
-            RefusedError: It was not kept; the message says why.
+            RefusedError: The frame was not kept; the message says why.
         """
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
@@ -93,12 +93,12 @@ class KeptFrames:
         )
 
     def next_after(self, captured_ns: int) -> Arrival | None:
-        """Return the next frame to track while catching up; None if none is newer.
+        """Return the next frame to track while catching up, or None if none is newer.
 
-        It is the newest one at most :data:`STRIDE_S` after the last, or else the first one after it.
+        This is the newest one within :data:`STRIDE_S` after the last or, if there is none, the first one after it.
 
         Args:
-            captured_ns: Capture time of the last one.
+            captured_ns: Capture time of the last frame tracked.
         """
         best = None
         for arrival in self._frames:
@@ -112,22 +112,22 @@ class KeptFrames:
 
 
 _DEPTH: Final = 8  # frames queued for JPEG encoding: the one shown on the page must not be dropped
-_SAMPLES: Final = 1024  # of feedback, for the frames kept
-_RESULTS: Final = 16  # of processors
+_SAMPLES: Final = 1024  # samples of feedback kept for the frames
+_RESULTS: Final = 16  # results of processors kept
 
 
 class FrameKeeper:
-    """Keeps frames of one camera, with feedback and detections, until :meth:`close`.
+    """Keeps one camera's frames, with feedback and detections, until :meth:`close`.
 
     Args:
-        drone: Provides the frames; may be an observer.
+        drone: Provides the frames; may be connected as an observer.
         camera: The camera's name.
         first: Called once with the capture time of the first frame kept [ns], on the listener's thread.
     """
 
     def __init__(self, drone: Drone, camera: str, first: Callable[[int], None] = lambda _: None) -> None:
         self.camera = camera
-        self.keeps = True  #: keep older frames, not just the newest
+        self.keeps = True  #: whether to keep older frames, not only the newest
         self._first: Callable[[int], None] | None = first
         self._kept = KeptFrames()
         self._newest: Frame | None = None
@@ -142,25 +142,25 @@ class FrameKeeper:
         ]
 
     def find(self, captured_ns: int) -> Arrival:
-        """Return the frame with this capture time; :class:`RefusedError` if it was not kept."""
+        """Return the frame with this capture time; raise :class:`RefusedError` if it was not kept."""
         with self._news:
             return self._kept.find(captured_ns)
 
     def catch_up(self, captured_ns: int) -> Arrival | None:
-        """Return the next frame to track while catching up; None if none is newer."""
+        """Return the next frame to track while catching up, or None if none is newer."""
         with self._news:
             return self._kept.next_after(captured_ns)
 
     def newest(self, captured_ns: int, timeout_s: float) -> Frame | None:
-        """Wait for a frame other than the one with this capture time, and return the newest; None if too late."""
+        """Wait for a frame other than the one with this capture time; return the newest, or None if too late."""
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # its memory belongs to the proxy
+            frame, self._newest = self._newest, None  # the frame's memory belongs to the proxy
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:
-        """Return and remove the feedback up to a capture time [ns]; None: all."""
+        """Return and remove the feedback up to a capture time [ns]; None: all of it."""
         taken = []
         with self._news:
             while self._samples and (until_ns is None or self._samples[0].captured_ns <= until_ns):
@@ -199,7 +199,7 @@ class FrameKeeper:
     def _on_frame(self, frame: Frame) -> None:
         kept = compressed(frame) if self.keeps else None
         with self._news:
-            if self._closed or not self._samples:  # the vehicle's state at its capture is unknown
+            if self._closed or not self._samples:  # the vehicle's state when the frame was captured is unknown
                 return
             if kept is not None and self.keeps:
                 self._kept.add(kept)
@@ -211,14 +211,14 @@ class FrameKeeper:
 
 
 def warm_up() -> None:
-    """Track once, in noise, because its imports hold the interpreter lock while others fly by this cockpit.
+    """Track once, in noise, because imports hold the GIL and would later stall flights through this cockpit.
 
-    SciPy, which matches detections, takes half a second to import on an idle computer and seconds on a busy one.
-    Therefore this runs as the cockpit starts, on a thread other than the event loop's, and not when a first target is
-    marked.
+    SciPy, which matches detections, takes half a second to import on an idle computer and seconds on a busy one. This
+    therefore runs when the cockpit starts, on a thread other than the event loop's, rather than when the first target
+    is marked.
     """
     noise = np.random.default_rng(1).integers(0, 255, (96, 96, 3), np.uint8)
-    with suppress(MissingExtraError):  # reported when a target is marked
+    with suppress(MissingExtraError):  # will be reported when a target is marked
         tracker = LongTermTracker()
         tracker.start(noise, (32.0, 32.0, 24.0, 32.0))
         tracker.update(noise)
@@ -226,7 +226,7 @@ def warm_up() -> None:
 
 
 class Follower(Protocol):
-    """The part of :class:`skyloop.control.target_follower.TargetFollower` used here; called from one thread."""
+    """The part of :class:`skyloop.control.target_follower.TargetFollower` used here; called on one thread."""
 
     mode: Any
     settings: Any
@@ -246,14 +246,14 @@ class TrackReport:
     """The result of one step.
 
     Attributes:
-        status: The follower's; None before its first frame.
+        status: The follower's status; None before its first frame.
         caught_up: Whether it has tracked up to the newest frame.
-        action: The set-point for now; None if none is wanted, and while catching up.
+        action: The current set-point; None if none is wanted, and while catching up.
         over: Whether the follower has given up.
         size: Width and height of the frames [px].
-        frame_ns: Time of tracking the last frame, on this process's clock.
-        frame_age_s: Age of that frame when it was tracked [s].
-        problem: An error of the follower, which is not called again; empty: none.
+        frame_ns: When the last frame was tracked, on this process's clock.
+        frame_age_s: Age of that frame at that time [s].
+        problem: An error in the follower, which is not called again; empty if there is none.
     """
 
     status: FollowStatus | None
@@ -267,10 +267,10 @@ class TrackReport:
 
 
 class TargetTracker:
-    """Calls a follower with frames and feedback on a separate thread, and reports each step.
+    """Calls a follower with frames and feedback on a separate thread and reports each step.
 
     Args:
-        drone: Publishes the drawings; may be an observer.
+        drone: Publishes the drawings; may be connected as an observer.
         keeper: Keeps the frames; closed with this object.
         begin: The frame under the box.
         make: Creates the follower; called on the thread.
@@ -288,8 +288,8 @@ class TargetTracker:
         clock: Clock = monotonic_ns,
     ) -> None:
         self.steers = False  #: whether set-points are wanted
-        self.mode = ""  #: applied with the next step; empty: unchanged
-        self.settings: Any = None  #: the same; None: unchanged
+        self.mode = ""  #: mode to apply with the next step; empty: unchanged
+        self.settings: Any = None  #: settings to apply with the next step; None: unchanged
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
@@ -298,7 +298,7 @@ class TargetTracker:
         self._report = report
         self._clock = clock
         self._closed = False
-        self._seen_ns = 0  # capture time of the last tracked frame
+        self._seen_ns = 0  # capture time of the last frame tracked
         self._frame_ns = clock()
         self._frame_age_s = 0.0
         self._size = (begin.header.width, begin.header.height)
@@ -336,7 +336,7 @@ class TargetTracker:
             self._keeper.close()
 
     def _catch_up(self, follower: Follower) -> None:
-        """Track in the kept frames, from that of the box on, for :data:`KEPT_S` at most; then in the newest."""
+        """Track in the kept frames, starting at that of the box, for at most :data:`KEPT_S`; then in the newest."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
         arrival: Arrival | None
         arrival, self._begin = self._begin, None
@@ -357,12 +357,12 @@ class TargetTracker:
                 follower.settings = settings
         self._feed(follower, None)
         for result in self._keeper.results():
-            with suppress(DecodeError, MissingExtraError):  # as if no program had sent any detections
+            with suppress(DecodeError, MissingExtraError):  # treat it as if no program had sent any detections
                 if isinstance(value := result.value, dict) and "detections" in value:
                     follower.detected(detections_of(value), result.captured_ns)
         if frame is not None:
             self._track(follower, frame)
-        # A law that flies nothing would count on motion that never happens.
+        # A control law that does not fly would expect motion that never happens.
         action = follower.step(self._clock() + self._drone.clock_offset_ns) if self.steers else None
         self._report(self._made(follower, action))
 
@@ -372,7 +372,7 @@ class TargetTracker:
 
     def _track(self, follower: Follower, frame: Frame) -> None:
         shapes = follower.look(frame)
-        if not self.steers:  # the drawing would include the law's state
+        if not self.steers:  # the drawing would include the control law's state
             shapes = [one for one in shapes if not isinstance(one, Text)]
         self._seen_ns = frame.captured_ns
         self._frame_ns = self._clock()

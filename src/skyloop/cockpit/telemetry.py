@@ -1,4 +1,4 @@
-"""The view model: a drone's data for pages, made once for all of them, as plain JSON values.
+"""The view model: a drone's data for pages, created once for all of them, as plain JSON values.
 
 All values are in SI units and radians; pages convert. Unknown values are null.
 """
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 
 _TARGET = re.compile(r"truth\.target\d*\.\w+")
-MAX_TEXT = 1000  #: characters of an event sent to pages: a new page may get hundreds of events
+MAX_TEXT = 1000  #: maximum length of an event's text; a new page may get hundreds of events
 
-#: The page's names for feedback's numbers.
+#: The page's names for the numbers in feedback.
 _NUMBERS = {
     "battery": "battery",
     "battery_v": "battery_v",
@@ -45,7 +45,7 @@ _NUMBERS = {
     "yaw": "yaw_rad",
     "altitude": "altitude_m",
 }
-#: The page's names for feedback's vectors and their components: body axes (x forward, y left, z up) or world axes.
+#: The page's names for the vectors in feedback and their components: body axes (x forward, y left, z up) or world axes.
 _VECTORS = {
     "velocity": ("velocity_m_s", ("forward", "left", "up")),
     "angular_velocity": ("angular_velocity_rad_s", ("x", "y", "z")),
@@ -53,26 +53,26 @@ _VECTORS = {
     "position": ("position_m", ("x", "y", "z")),
 }
 _BROKEN = (str(LinkState.LOST), str(LinkState.CLOSED))
-_CHANNELS_S = 0.5  # between updates: statistics cost sorting, and people read no faster
+_CHANNELS_S = 0.5  # interval between updates: statistics require sorting, and people read no faster
 
 encode_json = msgspec.json.Encoder().encode
 
 
 def number(value: float | None) -> float | None:
-    """Return a number for JSON, to seven digits; None if it is unknown or not finite."""
+    """Round a number to seven digits for JSON; return None if it is unknown or not finite."""
     return None if value is None or not math.isfinite(value) else float(f"{value:.7g}")
 
 
 def vector(values: tuple[float, ...] | None) -> list[float | None] | None:
-    """Return a vector for JSON; None if it is unknown."""
+    """Convert a vector for JSON; return None if it is unknown."""
     return None if values is None else [number(value) for value in values]
 
 
 def feedback_values(feedback: Feedback, now_ns: int) -> Json:
-    """Return feedback as JSON values; ``now_ns`` is the proxy's clock."""
+    """Convert feedback to JSON values; ``now_ns`` is on the proxy's clock."""
     return {
         "age_s": number(seconds(now_ns - feedback.captured_ns)),
-        "captured_ns": str(feedback.captured_ns),  # too large for JavaScript's numbers
+        "captured_ns": str(feedback.captured_ns),  # too large for numbers in JavaScript
         "state": str(feedback.state),
         **_scalars(feedback),
         "velocity": vector(feedback.velocity_m_s),
@@ -90,7 +90,7 @@ def _scalars(feedback: Feedback) -> dict[str, float | None]:
 
 
 def motion_values(feedback: Feedback | None) -> Json:
-    """Return the values for the instruments, each null if unknown."""
+    """Return the values for the instruments; unknown ones are null."""
     if feedback is None:
         names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "start", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
@@ -112,14 +112,14 @@ def motion_values(feedback: Feedback | None) -> Json:
 def flat_values(
     feedback: Feedback | None, logged: Mapping[str, float], set_point: AnyAction | None
 ) -> dict[str, float | None]:
-    """Return every number under a unique name, for plots.
+    """Return every number under a unique name, for use in plots.
 
     Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. Unknown numbers are omitted.
 
     Args:
-        feedback: The newest, None for none.
-        logged: The newest number of each series.
-        set_point: The command applied, None for none.
+        feedback: The newest feedback, or None.
+        logged: The newest number in each series.
+        set_point: The command applied, or None.
     """
     found: dict[str, float | None] = {}
     if feedback is not None:
@@ -137,7 +137,7 @@ def flat_values(
 
 
 def set_point_values(action: AnyAction, age_s: float) -> Json:
-    """Return a command, as applied, as JSON values."""
+    """Convert a command, as applied, to JSON values."""
     return {
         "action": ACTION_NAMES[type(action)],
         "values": {name: number(value) for name, value in _fields(action)},
@@ -146,7 +146,7 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 
 
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
-    """Return the pose from motion capture as JSON values.
+    """Convert a motion capture pose to JSON values.
 
     Args:
         pose: Position [m] and quaternion x, y, z, w; None if unknown.
@@ -158,12 +158,12 @@ def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
 
 
 def truth_values(native: Mapping[str, Value] | None) -> Json | None:
-    """Return a simulated vehicle's true pose: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
+    """Return a simulated vehicle's true pose: ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad] from ``native``."""
     return None if native is None else _place(native, "truth")
 
 
 def target_values(native: Mapping[str, Value] | None) -> list[Json]:
-    """Return the moving targets of a simulated world: ``truth.target``, ``truth.target2``, …, as JSON values."""
+    """Return a simulated world's moving targets (``truth.target``, ``truth.target2``, …) as JSON values."""
     if native is None:
         return []
     names = sorted({key.rpartition(".")[0] for key in native if _TARGET.fullmatch(key)})
@@ -172,12 +172,12 @@ def target_values(native: Mapping[str, Value] | None) -> list[Json]:
 
 
 def event_values(number_: int, event: Event, now_ns: int) -> Json:
-    """Return an event as JSON values.
+    """Convert an event to JSON values.
 
     Args:
-        number_: The number assigned by the cockpit.
+        number_: The number that the cockpit assigned to it.
         event: The event.
-        now_ns: The proxy's clock.
+        now_ns: The current time on the proxy's clock.
     """
     return {
         "n": number_,
@@ -191,7 +191,7 @@ def event_values(number_: int, event: Event, now_ns: int) -> Json:
 
 
 def channel_values(stats: ChannelStats) -> Json:
-    """Return one channel's statistics as JSON values; delays in seconds."""
+    """Convert one channel's statistics to JSON values, with delays in seconds."""
     delay = stats.delay_s
     return {
         "count": stats.count,
@@ -227,7 +227,7 @@ def _fields(action: AnyAction) -> Iterator[tuple[str, float]]:
 
 
 class TelemetryView:
-    """One drone as pages see it. Used on the event loop.
+    """One drone as seen by pages. Used on the event loop.
 
     Args:
         station: The drone.
@@ -243,7 +243,7 @@ class TelemetryView:
         self._channels_task: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """Return the values that only change with the vehicle."""
+        """Return the values that change only with the vehicle."""
         station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",
@@ -259,7 +259,7 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """Return the newest of all changing values, as a JSON object without its last brace."""
+        """Return the newest of all changing values, as a JSON object that lacks its final brace."""
         self._refresh_channels()
         return encode_json(self._values(self._clock()))[:-1]
 
@@ -285,11 +285,11 @@ class TelemetryView:
         return [event_values(number_, event, now_ns) for number_, event in events]
 
     def alarms(self, feedback: Feedback | None) -> list[Alarm]:
-        """Return the present alarms, the most severe first."""
+        """Return the current alarms, the most severe first."""
         drone = self._station.drone
-        # Feedback that is old because it is sent less often is no reason for an alarm.
+        # Feedback that is old only because it is sent less often is no reason for an alarm.
         age_s = None if feedback is None else self._age_s(feedback.captured_ns) - self._station.feedback_period_s
-        ages: dict[str, float] = {}  # by camera, of the youngest stream shown
+        ages: dict[str, float] = {}  # age of the newest stream shown, by camera
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
                 ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
@@ -300,16 +300,16 @@ class TelemetryView:
         return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 
     def holder(self, feedback: Feedback | None) -> str | None:
-        """Return the name of the holder of the authority.
+        """Return the name of the authority's holder.
 
-        None if the lease ended by silence, though feedback keeps the name, and if there is no proxy that could grant
-        one.
+        None if the lease ended because of silence, although feedback still has the name, and if there is no proxy that
+        could grant a lease.
         """
         broken = self._links()["application"] in _BROKEN
         return None if feedback is None or broken or not feedback.lease else feedback.owner
 
     def is_mine(self, feedback: Feedback | None) -> bool:
-        """Return whether a page of this cockpit holds the authority."""
+        """Return whether one of this cockpit's pages holds the authority."""
         return (
             feedback is not None
             and feedback.lease > 0
@@ -322,7 +322,7 @@ class TelemetryView:
         station, log_feed, feedback = self._station, self._station.log_feed, self._feedback()
         links = self._links()
         if links["application"] in _BROKEN:
-            log_feed.applied = None  # unknown now, and no longer applied once the link is back
+            log_feed.applied = None  # currently unknown, and no longer applied once the link is restored
         applied = log_feed.applied
         native = None if feedback is None else feedback.native
         proxy_ns = now_ns + station.drone.clock_offset_ns
@@ -350,7 +350,7 @@ class TelemetryView:
         try:
             return self._station.feedback()
         except LinkError:
-            return None  # none yet, or closed
+            return None  # there is none yet, or it was closed
 
     def _links(self) -> Json:
         link = self._station.drone.link
@@ -372,7 +372,7 @@ class TelemetryView:
         }
 
     def _waypoints(self) -> list[Json]:
-        """Return the goals of pages, followed by those logged by controllers."""
+        """Return the goals of pages, followed by those that controllers have logged."""
         goals = [
             {"position": vector(goal.position), "yaw": number(goal.yaw), "app": app}
             for app, goal in self._station.goals.items()
@@ -384,11 +384,11 @@ class TelemetryView:
         return goals + logged
 
     def _age_s(self, captured_ns: int) -> float:
-        """Return the age of a timestamp on the proxy's clock [s]."""
+        """Return the age of a timestamp that is on the proxy's clock [s]."""
         return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
 
     def _refresh_channels(self) -> None:
-        """Start to read the statistics again if they are old, without waiting."""
+        """Start reading the statistics again if they are old, without waiting for the result."""
         now_ns = self._clock()
         old = self._channels_ns is None or seconds(now_ns - self._channels_ns) >= _CHANNELS_S
         if self._channels_task is None and old:
@@ -396,7 +396,7 @@ class TelemetryView:
             self._channels_task = asyncio.create_task(self._read_channels())
 
     async def _read_channels(self) -> None:
-        # On another thread: the drone asks the proxy for the command delay, and waits for the answer.
+        # On another thread, because the drone asks the proxy for the command delay and waits for the answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
             for feed in self._station.streams.values():  # H.264 shown on pages does not arrive as frames
@@ -405,7 +405,7 @@ class TelemetryView:
                 if youngest_s is not None and (known is None or known.age_s is None or youngest_s < known.age_s):
                     stats = {**stats, name: feed.stats()}
             shown = {feed.camera for feed in self._station.feeds if feed.wanted}
-            # No statistics for video that no page shows: it was not requested, so none arrived.
+            # There are no statistics for video that no page shows: it was not requested, so none arrived.
             stats = {
                 name: one
                 for name, one in stats.items()
@@ -413,6 +413,6 @@ class TelemetryView:
             }
             self._channels = {name: channel_values(one) for name, one in stats.items()}
         except LinkError:
-            pass  # closed meanwhile
+            pass  # closed in the meantime
         finally:
             self._channels_task = None

@@ -1,4 +1,4 @@
-"""Pages without a browser, for tests and for measuring the cost of pages.
+"""Simulate pages without a browser, for tests and for measuring what pages cost.
 
 ::
 
@@ -6,8 +6,8 @@
         …
     print(pages.frames, pages.newest_age_s)
 
-Each opens the telemetry and video of one drone and acknowledges every frame, as a browser's page does after drawing
-it. Nothing is decoded: drawing only costs the browser.
+Each page opens the telemetry and video of one drone and acknowledges every frame, as a page in a browser does after
+drawing it. Nothing is decoded, because drawing costs only the browser.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STARTS_WITHIN_S: Final = 10.0
 
 
 class HeadlessPage:
-    """One page that shows one drone. Used on one event loop; the counts may be read from any thread."""
+    """One page that shows one drone. Used on one event loop; the counts may be read on any thread."""
 
     def __init__(
         self,
@@ -46,23 +46,23 @@ class HeadlessPage:
         tls: ssl.SSLContext | None = None,
         draw_s: float = 0.0,
     ) -> None:
-        """Prepare a page without opening anything.
+        """Initialise a page without opening anything.
 
         Args:
-            address: Of the cockpit, as printed.
+            address: Address of the cockpit, as printed.
             drone: The drone's name.
-            cameras: The cameras to watch (default: the first).
-            token: A token, if the cockpit asks for one.
-            tls: For an ``https`` address.
-            draw_s: Simulated time to draw a frame [s].
+            cameras: The cameras to watch; the first one by default.
+            token: A token, if the cockpit requires one.
+            tls: TLS context for an ``https`` address.
+            draw_s: Simulated time that it takes to draw a frame [s].
         """
         self.drone = drone
-        self.states = 0  #: telemetry messages
+        self.states = 0  #: number of telemetry messages
         self.frames = 0
-        self.bytes = 0  #: of all frames
-        self.newest_age_s: float | None = None  #: of the newest frame on arrival, if both ends share a clock
+        self.bytes = 0  #: total size of all frames
+        self.newest_age_s: float | None = None  #: age of the newest frame on arrival, if both ends share a clock
         self.vehicle: dict[str, Any] = {}
-        self.state: dict[str, Any] = {}  #: the newest
+        self.state: dict[str, Any] = {}  #: the newest state
         self._origin = address.rstrip("/")
         self._cameras = cameras
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
@@ -84,7 +84,7 @@ class HeadlessPage:
         """Watch until cancelled.
 
         Raises:
-            LinkError: The cockpit closes the connection, or refuses the page.
+            LinkError: The cockpit closed the connection or refused the page.
         """
         base = f"/ws/drones/{self.drone}"
         try:
@@ -131,17 +131,17 @@ def unpack_head(message: bytes) -> dict[str, Any]:
 
 
 class Pages:
-    """Several pages on one separate thread; a context manager for programs without asyncio.
+    """Several pages on one separate thread; a context manager for programs that don't use asyncio.
 
-    Entering it returns once each page has its first state, and raises :class:`LinkError` if that takes longer than
+    Entering it waits until each page has its first state, and raises :class:`LinkError` if that takes longer than
     :data:`STARTS_WITHIN_S`.
     """
 
     def __init__(self, address: str, drone: str, count: int = 1, **options: Any) -> None:
-        """Prepare the pages.
+        """Initialise the pages.
 
         Args:
-            address: Of the cockpit, as printed.
+            address: Address of the cockpit, as printed.
             drone: The drone's name.
             count: The number of pages.
             **options: As for :class:`HeadlessPage`.
@@ -155,7 +155,7 @@ class Pages:
 
     @property
     def frames(self) -> int:
-        """Total frames of all pages."""
+        """Total number of frames on all pages."""
         return sum(client.frames for client in self.clients)
 
     @property
@@ -166,10 +166,10 @@ class Pages:
         return max(known) if known and len(known) == len(ages) else None
 
     def __enter__(self) -> Self:
-        """Open the pages, and return once each has its first state.
+        """Open the pages and wait until each has its first state.
 
         Raises:
-            LinkError: That takes longer than :data:`STARTS_WITHIN_S`.
+            LinkError: It takes longer than :data:`STARTS_WITHIN_S`.
         """
         self._thread.start()
         self._changed.wait(STARTS_WITHIN_S)
@@ -181,7 +181,7 @@ class Pages:
     def close(self) -> None:
         """Close all pages. Idempotent."""
         if self._loop is not None and self._stop is not None and not self._loop.is_closed():
-            with suppress(RuntimeError):  # the loop was closed at this moment
+            with suppress(RuntimeError):  # the loop was closed at just this moment
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
 

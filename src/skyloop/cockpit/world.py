@@ -1,4 +1,4 @@
-"""A drone's surroundings: the scenery, where it may fly, where its cameras point; and whether it is ready.
+"""A drone's surroundings: the scenery, where it may fly, where its cameras point; and whether the drone is ready.
 
 All requests are read-only.
 """
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from skyloop.messages.parameter import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
-RECORDED: Final = "recorded."  #: prefix of recorded parameters: docs/replay.md
+RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Return a drone's surroundings for maps. Asks its proxy and waits for the answers.
+    """Return a drone's surroundings for maps. This queries its proxy and waits for the answers.
 
     Args:
         drone: The drone.
-        given: The scenery for a drone that does not report its own.
+        given: The scenery for a drone that does not report any.
 
     Raises:
         LinkError: The proxy does not answer.
@@ -63,11 +63,11 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 
 
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
-    """Return the proxy's reasons against flying straight to a place from the drone's position.
+    """Return the proxy's objections to flying straight to a place from the drone's position.
 
     Args:
         drone: The drone.
-        place: World axes [m].
+        place: The place, in world axes [m].
 
     Raises:
         LinkError: The proxy does not answer.
@@ -84,7 +84,7 @@ def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
 
 
 def space_from(read: Callable[[str], Value | None]) -> Space:
-    """Return where parameters allow a vehicle to fly; missing ones limit nothing."""
+    """Return where parameters allow a vehicle to fly; a missing parameter means no limit."""
 
     def edge(name: str) -> float:
         value = read(name)
@@ -101,7 +101,7 @@ def space_from(read: Callable[[str], Value | None]) -> Space:
 
 
 def geometry_values(world: WorldGeometry | None) -> Json:
-    """Return a world's scenery as JSON values; empty lists if nothing is known."""
+    """Convert a world's scenery to JSON values; lists are empty if nothing is known."""
     if world is None:
         return {"name": "", "room": None, "solids": [], "gates": [], "markers": [], "starts": [], "left_out": 0}
     room = None
@@ -119,7 +119,7 @@ def geometry_values(world: WorldGeometry | None) -> Json:
 
 
 def view_values(camera: CameraInfo) -> Json:
-    """Return a camera's view: the rays through its pictures' corners, in body axes; null if unknown."""
+    """Return a camera's view: the rays through the corners of its pictures, in body axes; null if unknown."""
     lens, rotation = camera.intrinsics, camera.rotation
     rays = None
     if lens is not None and rotation is not None and lens.fx > 0 and lens.fy > 0:
@@ -142,7 +142,7 @@ def _newest(drone: Drone) -> Feedback | None:
 def _reader(drone: Drone) -> Callable[[str], Value | None]:
     """Return a function that reads a parameter's value, or None if there is no such parameter."""
     found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
-    # A replay's own proxy has meaningless limits and zones: show those of the recorded vehicle.
+    # A replay's own proxy has meaningless limits and zones, so show those of the recorded vehicle.
     prefix = RECORDED if drone.uri.startswith("replay:") else ""
     return lambda name: found.get(prefix + name)
 
@@ -179,7 +179,7 @@ def _fields(thing: Any) -> Json:
 
 
 _OURS: Final = PreflightFinding("control", Level.OK, "a page of this cockpit has control")
-MAX_ASKING: Final = 4  #: requests to drones at one time; each may block its thread for seconds
+MAX_ASKING: Final = 4  #: simultaneous requests to drones; each may block its thread for seconds
 
 
 class WorldApi:
@@ -187,8 +187,8 @@ class WorldApi:
 
     Args:
         fleet: The drones.
-        recordings: Where they are recorded.
-        given: The surroundings of drones that don't report them.
+        recordings: The recordings of the same drones.
+        given: The surroundings of drones that don't report any.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
@@ -212,7 +212,7 @@ class WorldApi:
 
     @answered
     async def way(self, request: Request) -> Response:
-        """Answer with the reasons against flying straight to a place, ``?to=X,Y,Z``."""
+        """Answer with the objections to flying straight to a place, ``?to=X,Y,Z``."""
         place = _place(request.query_params.get("to", ""))
         return await self._ask(request, lambda drone: way_values(drone, place))
 
@@ -230,7 +230,7 @@ class WorldApi:
         return await self._ask(request, check)
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
-        """Ask a drone on a thread, as its answer may take a while."""
+        """Query a drone on a thread, because its answer may take a while."""
         name, stations = request.path_params["name"], self._fleet.stations
         if name not in stations:
             raise UnknownNameError("drone", name, stations)

@@ -1,1 +1,1 @@
-"""Many vehicles in one process: proxies that share their threads, added and removed while others fly."""
+"""Many vehicles in one process: their proxies share threads, and are added and removed while others fly."""

@@ -1,4 +1,4 @@
-"""A host's vehicle file, ``fleet.toml``. Pure except for reading it; described in ``docs/host.md``."""
+"""Read a host's vehicle file, ``fleet.toml``, as described in ``docs/host.md``. Pure except for reading the file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
 HOST: Final = "host"  #: default name of a host
-#: Schemes whose address creates the vehicle: two vehicles may share one.
+#: Schemes of addresses that create a vehicle, so that two vehicles may have the same address.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")
 
 
 class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``limits``: the proxy parameters of the same names."""
+    """``limits``: the proxy parameters with the same names."""
 
     tilt: float | None = None
     climb: float | None = None
@@ -35,13 +35,13 @@ class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unkno
 
 
 class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``[defaults]``: settings of each vehicle that does not override them."""
+    """``[defaults]``: settings for each vehicle that does not override them."""
 
     network: Text | None = None  #: like ``--network`` of ``skyloop proxy``; ``off`` for this host only
     listen: list[str] | None = None
-    multicast: bool | None = None  #: whether multicast discovery works, where ``network`` names it
+    multicast: bool | None = None  #: whether multicast discovery is used if ``network`` includes it
     keys: Text | None = None  #: an identity's folder
-    group: Text | None = None  #: users who may also connect
+    group: Text | None = None  #: users who may connect in addition to this one
     limits: FlightLimits | None = None
     zones: list[str] | None = None
     parameters: dict[str, Any] | None = None  #: the proxy's parameters, by name
@@ -50,7 +50,7 @@ class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_f
 
 
 class Vehicle(Defaults, frozen=True, omit_defaults=True, forbid_unknown_fields=True, kw_only=True):
-    """``[[vehicle]]``."""
+    """One vehicle in the file: ``[[vehicle]]``."""
 
     name: Text
     address: Text
@@ -63,7 +63,7 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One vehicle of a host, with all defaults filled in."""
+    """The settings of one vehicle on a host, with all defaults filled in."""
 
     name: str
     address: VehicleUri
@@ -78,12 +78,12 @@ class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def encode_handed(value: object) -> bytes:
-    """Encode settings, alone or nested, for the process that serves the vehicle, including secrets in addresses."""
+    """Encode settings, alone or nested, for the process that serves the vehicle, including any secrets in addresses."""
     return msgspec.json.encode(value, enc_hook=_revealed)
 
 
 def decoder_of_handed(kind: Any) -> msgspec.json.Decoder[Any]:
-    """Return a decoder for :func:`encode_handed`'s output, of this type."""
+    """Return a decoder for values of this type encoded by :func:`encode_handed`."""
     return msgspec.json.Decoder(kind, dec_hook=lambda _, text: parse_uri(text))
 
 
@@ -104,12 +104,12 @@ class Fleet(msgspec.Struct, frozen=True):
 def read_fleet(path: Path) -> Fleet:
     """Read a host's vehicle file.
 
-    Key folders in it are relative to the file's own folder.
+    Key folders in the file are relative to its own folder.
 
     Raises:
         UsageError: The file is missing or unreadable.
-        FileFormatError: It is not TOML, a key is unknown or missing, or a value is invalid; the message says where, and
-            what is allowed.
+        FileFormatError: The file is not TOML, a key is unknown or missing, or a value is invalid; the message says
+            where, and what is allowed.
     """
     path = expand(path)
     try:
@@ -137,7 +137,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def parse_fleet(text: str, source: str) -> Fleet:
-    """Parse a vehicle file's text; see :func:`read_fleet`."""
+    """Parse the text of a vehicle file; see :func:`read_fleet`."""
     found = read_tables(parse_toml(text, source), source, _File)
     top = Place(source)
     _checked(top, "name", lambda: check_name(found.name))
@@ -158,7 +158,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with the defaults filled in; ``own`` holds the file's values at ``place``.
+    """Return a vehicle's settings with defaults filled in; ``own`` contains the file's values at ``place``.
 
     Raises:
         FileFormatError: A value is invalid.
@@ -217,7 +217,7 @@ def _check_preset(place: Place, name: str, presets: dict[str, Value]) -> None:
 
 
 def _checked(place: Place, key: str, check: Any) -> Any:
-    """Return ``check``'s result; turn its exceptions into errors of the file."""
+    """Return the result of ``check``; convert its exceptions to errors about the file."""
     try:
         return check()
     except FileFormatError:

@@ -1,4 +1,4 @@
-"""The host: any number of vehicles in one process, which fail, join and leave without affecting the others."""
+"""The host: any number of vehicles in one process, which can fail, join and leave without affecting the others."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-LAND_WITHIN_S: Final = 20.0  #: default time for a landing
-_AT_ONCE: Final = 8  # vehicles that start concurrently
+LAND_WITHIN_S: Final = 20.0  #: default time limit for a landing
+_AT_ONCE: Final = 8  # number of vehicles that start concurrently
 _STALL_S: Final = STALL_CHECKS * CHECK_S
 _HANG_S: Final = HANG_CHECKS * CHECK_S
 _log = logging.getLogger(__name__)
@@ -41,21 +41,21 @@ Announce = Callable[[str], None]
 
 
 class Host:
-    """Serves vehicles on shared threads, from its construction to :meth:`close`. Any thread.
+    """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
 
     Args:
-        announce: Called with a line for people when a vehicle joins, fails or leaves.
-        make: Creates an address's driver, for vehicles of this process.
+        announce: Called with a line of text for users when a vehicle joins, fails or leaves.
+        make: Creates the driver for an address; used for vehicles in this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
         self.announce = announce
         self._make_driver = make
         self._overview = OverviewRegistry()
-        self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order of joining
+        self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
         self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
-        self._reactor = Reactor()  # for vehicles that join
+        self._reactor = Reactor()  # used for vehicles that join
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -65,17 +65,17 @@ class Host:
         self._closing = False
 
     def proxies(self) -> list[Proxy]:
-        """Return the proxies now serving in this process. Any thread."""
+        """Return the proxies currently serving in this process. Any thread."""
         present = (vehicle.proxy for vehicle in list(self.vehicles.values()) if isinstance(vehicle, SharedVehicle))
         return [proxy for proxy in present if proxy is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
 
     def add(self, settings: VehicleSettings) -> HostedVehicle:
-        """Serve one more vehicle.
+        """Serve another vehicle.
 
         Raises:
-            NameTakenError: This host, or another running proxy, has the name.
+            NameTakenError: This host or another running proxy already has the name.
             SkyloopError: The vehicle can't be served; it is then listed as failed.
         """
         network = network_of(settings)
@@ -101,7 +101,7 @@ class Host:
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
-            # It may have been removed the moment it ran; _forget stops the ticks of an ended proxy.
+            # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
             if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
@@ -119,7 +119,7 @@ class Host:
             self._links.add(link, vehicle)
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
-        """Serve several vehicles, some concurrently; return by name why any of them failed."""
+        """Serve several vehicles, some concurrently; return by name why vehicles failed."""
         problems: dict[str, str] = {}
 
         def add(settings: VehicleSettings) -> None:
@@ -137,16 +137,16 @@ class Host:
 
         Args:
             name: The vehicle.
-            land: Land it even if it flies under a pilot's lease.
+            land: Whether to land the vehicle even if it flies under a pilot's lease.
             timeout_s: Time to wait for the landing [s].
 
         Returns:
             Its last status.
 
         Raises:
-            UnknownNameError: There is no vehicle of this name.
-            RefusedError: It flies under a lease (code ``flown``), or has not landed in time (``flying``); then it is
-                not removed.
+            UnknownNameError: There is no vehicle with this name.
+            RefusedError: The vehicle flies under a lease (code ``flown``) or has not landed in time (``flying``). In
+                either case it is not removed.
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -187,7 +187,7 @@ class Host:
         return ended
 
     def _forget(self, proxy: Proxy) -> None:
-        """Stop ticking an ended proxy, and close the loops that only it used."""
+        """Stop ticking a proxy that has ended, and close loops that only it used."""
         with self._lock:
             for loop in self._loops:
                 if isinstance(loop, Ticker):
@@ -198,11 +198,11 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Return whether new vehicles join this loop; otherwise it was left to a vehicle whose driver blocks."""
+        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
-        """Return a row for each vehicle, including those in the file that were not started."""
+        """Return a row for each vehicle, including vehicles from the file that have not been started."""
         with self._lock:
             vehicles = dict(self.vehicles)
             known = dict(self.known)
@@ -215,7 +215,7 @@ class Host:
         return rows
 
     def publish_keys(self, change: str) -> None:
-        """Publish news about the network's keys to everybody."""
+        """Publish updates about the network's keys to all clients."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
                 vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
@@ -226,12 +226,12 @@ class Host:
         within_s: float = 0.0,
         hurry: Callable[[], bool] = lambda: False,
     ) -> None:
-        """End all flights and proxies at once, and all threads that are not stuck. Idempotent.
+        """End all flights and proxies immediately, and all threads that are not stuck. Idempotent.
 
         Args:
-            reason: Why, for people.
-            within_s: Time allowed for landings [s].
-            hurry: Polled several times a second; True stops waiting for landings. So does Ctrl-C if nothing else
+            reason: The reason, shown to users.
+            within_s: Time limit for landings [s].
+            hurry: Polled several times a second; True ends the wait for landings. So does Ctrl-C if nothing else
                 handles it; it is raised at the end.
         """
         with self._lock:
@@ -247,7 +247,7 @@ class Host:
                 if proxy is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
-            # One thread each: a driver that hangs must not keep another vehicle in the air.
+            # Use one thread per vehicle: a driver that hangs must not keep another vehicle in the air.
             at_once(
                 {vehicle: partial(end, vehicle) for vehicle in vehicles},
                 tell=tell,
@@ -262,18 +262,18 @@ class Host:
     # Drivers that hang or fail -----------------------------------------------------------------------------------
 
     def _of(self, member: Any) -> SharedVehicle | None:
-        """Return this vehicle, or the one that owns this transport server or proxy."""
+        """Return the given vehicle, or the vehicle that owns the given transport server or proxy."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and member in (vehicle, vehicle.server, vehicle.proxy):
                 return vehicle
         return None
 
     def _on_stall(self, loop: SharedLoop, member: Any) -> None:
-        """Move all other vehicles of a loop to a new one."""
+        """Move all other vehicles from a stalled loop to a new one."""
         with self._lock:
             new: SharedLoop
             if not self._is_shared(loop):
-                return  # an earlier stall left the loop to this vehicle
+                return  # after an earlier stall, the loop was left to this vehicle
             if isinstance(loop, Reactor) and isinstance(member, SharedLocalServer):
                 new = self._reactor = loop.split(member)
             elif isinstance(loop, Ticker) and isinstance(member, Proxy):
@@ -289,7 +289,7 @@ class Host:
             vehicle.report_stall(_STALL_S)
 
     def _on_hang(self, loop: SharedLoop, member: Any) -> None:
-        """Give up a vehicle."""
+        """Give up a vehicle whose driver hangs."""
         with self._lock:
             self._loops.remove(loop)
         loop.close()  # in case it ever returns
@@ -303,7 +303,7 @@ class Host:
             self._give_up(vehicle, f"its driver fails at every tick, so that no failsafe runs: {error!r}")
 
     def _give_up(self, vehicle: SharedVehicle, reason: str) -> None:
-        """End a vehicle whose driver does not work, on a separate thread."""
+        """End a vehicle whose driver does not work. This runs on a separate thread."""
 
         def end() -> None:
             proxy = vehicle.proxy
@@ -316,11 +316,11 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle in the host's file.
+    """Return the settings of a vehicle from the host's file.
 
     Raises:
-        UnknownNameError: The file has no such vehicle.
-        UsageError: It is already running.
+        UnknownNameError: The file has no vehicle with this name.
+        UsageError: The vehicle is already running.
     """
     settings = host.known.get(name)
     if settings is None:

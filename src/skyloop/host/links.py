@@ -1,6 +1,6 @@
-"""One thread for many vehicles' links: with a thread each, most time would go to switching between them.
+"""One thread for many vehicles' links, because with a thread for each, most time would go to switching threads.
 
-Commands bypass it: they are sent on the thread that receives them.
+Commands bypass this thread: they are sent on the thread that receives them.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
 
-_LONGEST_WAIT_NS: Final = 1_000_000_000  #: of the selector
-_MOST_STALE: Final = 4  #: queue entries per link before stale ones are removed
+_LONGEST_WAIT_NS: Final = 1_000_000_000  #: maximum time to wait in the selector
+_MOST_STALE: Final = 4  #: number of queue entries per link at which stale ones are removed
 
 
 class LinkThread:
-    """Serves links on one thread, from its construction to :meth:`close`, when they are readable or due.
+    """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it runs, and can be split.
+    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
 
     Args:
         links: The initial links, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
-        self.inside: Any = None  #: the vehicle whose link is being served
+        self.inside: Any = None  #: the vehicle whose link is currently being served
         self.entries = 0  #: number of times :attr:`inside` was set
         self._selector = selectors.DefaultSelector()
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards whose code is running
+        self._lock = threading.Lock()  # guards the knowledge of whose code is running
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
-        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap of due times; an entry with another time is stale
+        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with other times are stale
         self._order = count()  # breaks ties between due times
-        self._paused: set[ServedLink] = set()  # after an error: not polled
+        self._paused: set[ServedLink] = set()  # links that are not polled because of an error
         self._closing = False
         self._selector.register(self._awake, selectors.EVENT_READ)
         for link, vehicle in (links or {}).items():
@@ -53,7 +53,7 @@ class LinkThread:
         self._thread.start()
 
     def add(self, link: ServedLink, vehicle: Any) -> None:
-        """Serve a link from now on, until it ends. Any thread."""
+        """Serve a link from now on until it ends. Any thread."""
         with self._lock:
             self._members[link] = vehicle
             self._plan(link, 0)
@@ -62,11 +62,11 @@ class LinkThread:
 
     @property
     def empty(self) -> bool:
-        """Whether it serves no link."""
+        """Whether there is no link to serve."""
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:
-        """Leave this thread to one vehicle's links, and return a new one for all others. Any thread."""
+        """Leave this thread to one vehicle's links; return a new one for all other links. Any thread."""
         with self._lock:
             others = {link: vehicle for link, vehicle in self._members.items() if vehicle is not stuck}
             for link in others:
@@ -74,7 +74,7 @@ class LinkThread:
         return LinkThread(others)
 
     def close(self) -> None:
-        """End the thread unless it is stuck, and any links that it still has. Idempotent."""
+        """End the thread, unless it is stuck, and any links that remain. Idempotent."""
         self._closing = True
         self._wake()
         if threading.current_thread() is not self._thread and self.inside is None:
@@ -91,7 +91,7 @@ class LinkThread:
             self._selector.unregister(link)
 
     def _plan(self, link: ServedLink, due_ns: int) -> None:
-        """Schedule a link to be served by then. With the lock held."""
+        """Schedule a link to be served by the given time. The lock must be held."""
         if self._due_ns.get(link) == due_ns:
             return
         self._due_ns[link] = due_ns
@@ -101,14 +101,14 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due; None if there is none. With the lock held."""
+        """Return when the next link is due, or None if there is none. The lock must be held."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
         return queue[0][0] if queue else None
 
     def _due(self, now_ns: int) -> set[ServedLink]:
-        """Return the links that are due. With the lock held."""
+        """Return the links that are due. The lock must be held."""
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
@@ -136,7 +136,7 @@ class LinkThread:
             self.inside = None
         with self._lock:
             left = list(self._members)
-        for link in left:  # of a vehicle that was dropped
+        for link in left:  # links of a vehicle that was dropped
             link.end()
         self._selector.close()
         self._awake.close()
@@ -146,10 +146,10 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread took it over meanwhile
+                return  # another thread has taken it over in the meantime
             if link in self._paused:
                 self._paused.remove(link)
-                readable = True  # it may be: it was not polled
+                readable = True  # it may be readable: it was not polled
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1
@@ -172,5 +172,5 @@ class LinkThread:
         link.end()
 
     def _wake(self) -> None:
-        with suppress(OSError):  # it is awake, or has ended
+        with suppress(OSError):  # the thread is awake, or has ended
             self._waker.send(b"\0")

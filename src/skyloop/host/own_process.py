@@ -1,8 +1,8 @@
 """A vehicle whose proxy runs in a separate process, which is restarted when it dies.
 
-The process is ``python -m skyloop.host.own_process NAME`` and receives its settings at the start. It ends with its
-host, at once and without landing, as a proxy within the host's process does. Each line of its standard output is a
-status in JSON for the host.
+The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. It ends with its
+host, immediately and without landing, just like a proxy within the host's process. Each line of its standard output
+is a status for the host in JSON.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from skyloop.proxy.serve import run
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
-STARTS_WITHIN_S: Final = 20.0  #: time for the first report
-FIRST_PAUSE_S: Final = 0.5  #: before the first restart; doubles with each death
-LONGEST_PAUSE_S: Final = 30.0  #: its limit
-#: Checks without a report, at four a second, after which the process counts as hung and is killed. Checks rather than
-#: seconds: a process does not hang because its computer was suspended.
+STARTS_WITHIN_S: Final = 20.0  #: time limit for the first report
+FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; doubles each time the process dies
+LONGEST_PAUSE_S: Final = 30.0  #: maximum length of that pause
+#: Checks without a report, at four per second, after which the process is considered hung and killed. Checks are
+#: counted rather than seconds, so that a process is not considered hung after its computer was suspended.
 SILENT_CHECKS: Final = 40
-STARTING_CHECKS: Final = 80  #: the same before its first report
-STEADY_S: Final = 60.0  #: after running for this long, a process that dies is restarted after the shortest pause
+STARTING_CHECKS: Final = 80  #: the same limit before the process has sent its first report
+STEADY_S: Final = 60.0  #: if it ran for this long before it died, a process is restarted after the shortest pause
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
 FAILED: Final = 1
-STATUS_EVERY_S: Final = 0.25  #: between reports
+STATUS_EVERY_S: Final = 0.25  #: interval between reports
 
 
 def pause_s(deaths: int) -> float:
-    """Return the pause before restarting a process that has died this many times in a row [s]."""
+    """Return the pause before restarting a process that has died this many times in succession [s]."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(deaths - 1, 20)))
 
 
 class OwnProcessVehicle(HostedVehicle):
-    """A vehicle with ``process = "own"``: its driver can harm only its own process.
+    """A vehicle with ``process = "own"``, whose driver can harm only its own process.
 
     Args:
-        settings: Its settings.
-        announce: Called with a line for people when its process dies and when it is restarted.
-        command: The command that starts the process, before the name; the settings are passed on.
+        settings: The vehicle's settings.
+        announce: Called with a line of text for users when its process dies and when it is restarted.
+        command: The command that starts the process, to which the name is appended. The settings are passed separately.
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class OwnProcessVehicle(HostedVehicle):
     ) -> None:
         super().__init__(settings)
         self._announce = announce
-        self._changed = threading.Condition()  # guards all below
-        self._reported: VehicleStatus | None = None  # by the present process
-        self._silent_checks = 0  # since it reported last
-        self._deaths = 0  # in a row
+        self._changed = threading.Condition()  # guards all of the following
+        self._reported: VehicleStatus | None = None  # status reported by the current process
+        self._silent_checks = 0  # checks since it last sent a report
+        self._deaths = 0  # number of deaths in succession
         self._runner = RestartingChild(
             [*command, settings.name],
             handed=encode_handed(settings).decode(),
@@ -93,7 +93,7 @@ class OwnProcessVehicle(HostedVehicle):
             self._reported, self._silent_checks = None, 0
 
     def _read(self, child: ChildProcess) -> None:
-        """Read a process's reports."""
+        """Read the reports of a process."""
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)
@@ -113,7 +113,7 @@ class OwnProcessVehicle(HostedVehicle):
                 self._announce(f"vehicle of {self.settings.name}: running again, process {child.pid}")
 
     def _is_silent(self) -> bool:
-        """Return whether the process has stopped reporting without being told to end."""
+        """Return whether the process has stopped sending reports without having been asked to end."""
         with self._changed:
             self._silent_checks += 1
             most = STARTING_CHECKS if self._reported is None else SILENT_CHECKS
@@ -123,7 +123,7 @@ class OwnProcessVehicle(HostedVehicle):
         return silent
 
     def _ended(self, child: ChildProcess | None, ending: str) -> float | None:
-        """Record that a process has ended; return the pause before the next one."""
+        """Record that a process has ended; return the pause before starting the next one."""
         with self._changed:
             reported = self._reported
             self.failed = (reported.failed if reported is not None else "") or f"its process {ending}"
@@ -157,7 +157,7 @@ class OwnProcessVehicle(HostedVehicle):
         *,
         unless_flying: bool = False,
     ) -> bool:
-        """Ask its process to land and end. It is not restarted."""
+        """Ask the process to land the vehicle and end. It is not restarted."""
         asked = self._runner.stopping
         child = self._runner.request_stop()
         if child is not None and child.code is None:
@@ -166,7 +166,7 @@ class OwnProcessVehicle(HostedVehicle):
             deadline_s = time.monotonic() + within_s
             while (left_s := deadline_s - time.monotonic()) > 0 and child.code is None:
                 if hurry():
-                    child.part()  # end at once, or land first if its vehicle would fall without it
+                    child.part()  # end immediately, or land first if the vehicle would otherwise fall
                 child.wait(min(left_s, _POLL_S))
             if unless_flying and child.code is None:
                 return False
@@ -177,10 +177,10 @@ class OwnProcessVehicle(HostedVehicle):
 
 
 def serve(settings: VehicleSettings) -> None:
-    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. On the main thread.
+    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. Must run on the main thread.
 
     Raises:
-        SkyloopError: It can't be served.
+        SkyloopError: The vehicle can't be served.
     """
     network = network_of(settings)
     driver = make_driver(settings.address)
@@ -196,7 +196,7 @@ def serve(settings: VehicleSettings) -> None:
     began_s, reported_s = time.monotonic(), 0.0
 
     def report() -> Sequence[str]:
-        """Report the proxy's status several times a second, and return news about the keys."""
+        """Report the proxy's status several times a second; return updates about the keys."""
         nonlocal reported_s
         now_s = time.monotonic()
         if now_s - reported_s >= STATUS_EVERY_S:
@@ -213,7 +213,7 @@ def _write(status: VehicleStatus) -> None:
 
 
 def main() -> None:
-    """Serve the vehicle whose settings were passed on."""
+    """Serve the vehicle whose settings were passed to this process."""
     settings = decoder_of_handed(VehicleSettings).decode(handed_over() or "")
     try:
         serve(settings)

@@ -1,7 +1,7 @@
-"""The host process behind ``skyloop host fleet.toml``, and its socket: ``add``, ``remove`` and ``status``.
+"""The host process run by ``skyloop host fleet.toml``, and its control socket: ``add``, ``remove`` and ``status``.
 
-Each connection carries one JSON request and one answer, split into packets. The socket ``NAME.host`` is beside the
-proxies' sockets and open to the same users: the host's own, the superuser, and members of its group.
+Each connection carries one JSON request and one answer, split into packets. The socket ``NAME.host`` is next to the
+proxies' sockets and accessible to the same users: the host's own, the superuser, and members of its group.
 """
 
 from __future__ import annotations
@@ -39,34 +39,34 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-_POLL_S: Final = 0.2  # between checks for signals and changes
-MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
-MAX_PACKET: Final = 1 << 16  #: bytes
-MAX_ANSWER: Final = 1 << 22  #: bytes
-ANSWERS_WITHIN_S: Final = 60.0  #: includes a landing before a removal
-_CHUNK: Final = 1 << 15  # bytes of a packet
+_POLL_S: Final = 0.2  # interval between checks for signals and changes
+MAX_REQUEST: Final = 1 << 22  #: maximum size in bytes, sent in packets of ``_CHUNK``
+MAX_PACKET: Final = 1 << 16  #: maximum size in bytes
+MAX_ANSWER: Final = 1 << 22  #: maximum size in bytes
+ANSWERS_WITHIN_S: Final = 60.0  #: includes the landing before a removal
+_CHUNK: Final = 1 << 15  # size of a packet in bytes
 _AGAIN_S: Final = 0.1  # pause after a failed accept
-_SLOW_S: Final = 2.0  # for the other end to receive or send a packet
+_SLOW_S: Final = 2.0  # time for the other end to receive or send a packet
 _log = logging.getLogger(__name__)
 
 
 def serve(
     fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND_WITHIN_S, metrics: str | None = None
 ) -> None:
-    """Serve all vehicles of a fleet that start automatically; blocks. On the main thread.
+    """Serve all vehicles of a fleet that start automatically. Blocks. Must run on the main thread.
 
-    Like ``skyloop proxy``, prints a line for each vehicle: ``failed NAME: …`` for one that can't be served, and
-    ``hosting …`` after all were tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
+    Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
+    …`` after all have been tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
     ``land_within_s`` [s]; a second signal ends the wait.
 
     Args:
         fleet: The vehicles.
-        group: Users who may also add and remove vehicles.
-        land_within_s: Time allowed for landings [s].
-        metrics: ``[HOST:]PORT`` of a Prometheus endpoint, which is announced; None: no endpoint.
+        group: Group of users who may also add and remove vehicles.
+        land_within_s: Time limit for landings [s].
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced; None: no endpoint.
 
     Raises:
-        UsageError: ``metrics`` is not an address, or can't be listened on.
+        UsageError: ``metrics`` is not an address, or listening on it failed.
         MissingExtraError: The extra ``metrics`` is needed and not installed.
         NameTakenError: A running host has the name.
         LinkError: The directory of sockets is not safe.
@@ -92,7 +92,7 @@ def serve(
         polls = _key_changes(fleet)
         gc.collect()
         gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
-        # Poll: the kernel may deliver a signal to any thread, which does not wake this one.
+        # Poll, because the kernel may deliver a signal to any thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -103,14 +103,14 @@ def serve(
 
 
 class Answering:
-    """Handles requests at a host's control socket; the defaults are for vehicles given only by address."""
+    """Answers requests at a host's control socket; the defaults are for vehicles given only by address."""
 
     def __init__(self, host: Host, defaults: Defaults) -> None:
         self._host = host
         self._defaults = defaults
 
     def __call__(self, request: Request) -> Answer:
-        """Carry out a request. On the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
+        """Carry out a request. Runs on the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
         host = self._host
         if isinstance(request, Remove):
             return Answer((host.remove(request.name, land=request.land),))
@@ -134,7 +134,7 @@ class Answering:
 
 
 class _Lines:
-    """Prints a vehicle's readiness, or the reason why it waits, whenever that changes."""
+    """Prints whether a vehicle is ready, or why it waits, whenever that changes."""
 
     def __init__(self) -> None:
         self._lines: dict[HostedVehicle, LinkLines] = {}
@@ -161,10 +161,10 @@ def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
 
 
 def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
-    """Return one source of key news for each of the fleet's key folders."""
+    """Return a source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # if the folder could not be served
+        with suppress(UsageError, ImportError):  # a folder that could not be served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
@@ -173,22 +173,22 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
 
 def announce(line: str) -> None:
     """Write a line to standard output."""
-    with suppress(OSError):  # the reader is gone: continue serving
+    with suppress(OSError):  # the reader is gone; continue serving
         print(line, flush=True)
 
 
 class Status(msgspec.Struct, frozen=True, tag="status"):
-    """Show all vehicles."""
+    """Request the status of all vehicles."""
 
 
 class Add(msgspec.Struct, frozen=True, tag="add"):
-    """Serve more vehicles; those already running are left unchanged."""
+    """Request to serve more vehicles; those already running are left unchanged."""
 
     vehicles: tuple[VehicleSettings, ...]
 
 
 class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
-    """Serve one more vehicle: one in the host's file by name, or any other by address."""
+    """Request to serve one more vehicle, either one from the host's file by name, or any other by address."""
 
     name: str
     address: str | None = None
@@ -196,7 +196,7 @@ class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
 
 
 class Remove(msgspec.Struct, frozen=True, tag="remove"):
-    """Land a vehicle, and stop serving it."""
+    """Request to land a vehicle and stop serving it."""
 
     name: str
     land: bool = False
@@ -208,10 +208,10 @@ Request = Status | Add | AddNamed | Remove
 class Answer(msgspec.Struct, frozen=True):
     """The host's answer."""
 
-    vehicles: tuple[VehicleStatus, ...] = ()  #: all of them, or those in the request
-    problems: dict[str, str] = {}  #: why some could not be added, by name
+    vehicles: tuple[VehicleStatus, ...] = ()  #: all vehicles, or those in the request
+    problems: dict[str, str] = {}  #: why vehicles could not be added, by name
     error: str = ""  #: why nothing was done
-    kind: str = ""  #: name of the error's class
+    kind: str = ""  #: class name of that error
     code: str = ""
 
 
@@ -225,7 +225,7 @@ _ERRORS: Final[dict[str, type[SkyloopError]]] = {
 
 
 class ControlServer:
-    """Accepts requests from this user and a group, from :meth:`start` to :meth:`stop`."""
+    """Accepts requests from this user and the members of a group, from :meth:`start` to :meth:`stop`."""
 
     def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
         self._name = name
@@ -264,13 +264,13 @@ class ControlServer:
         while self._listener is not None:
             try:
                 accepted, _ = listener.accept()
-            except OSError:  # closing, caller gone, or no descriptors left: pause before the next try
+            except OSError:  # closing, the caller is gone, or no descriptors are left: pause before trying again
                 self._ended.wait(_AGAIN_S)
                 continue
             sock = Socket(accepted.detach())
             try:
                 threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
-            except RuntimeError as error:  # no thread available at the moment
+            except RuntimeError as error:  # no thread is currently available
                 _log.warning("a request was not answered: %s", error)
                 sock.hang_up()
 
@@ -286,17 +286,17 @@ class ControlServer:
         sock.hang_up()
 
     def _answer(self, sock: Socket) -> Answer | None:
-        """Return the answer to a request; None if there is none, as when a client only checks for a host."""
+        """Return the answer to a request, or None if there was no request because a client only checked for a host."""
         if not may_connect(sock, self._directory.gid):
             return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
         while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
             received += packet
-            if len(packet) != _CHUNK:  # the last one
+            if len(packet) != _CHUNK:  # it was the last packet
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)
-                break  # the request happened to fill its last packet
+                break  # the request filled its last packet exactly
         if not received:
             return None
         if len(received) > MAX_REQUEST:
@@ -323,16 +323,16 @@ def _send(sock: Socket, text: bytes) -> None:
 
 
 def running_hosts(group: str | None = None) -> list[str]:
-    """Return the names of this machine's running hosts that this user may reach."""
+    """Return the names of the hosts running on this machine that this user may reach."""
     return [host.name for host in find_directory(group, HOST).proxies()]
 
 
 def chosen_host(name: str | None = None, group: str | None = None) -> str:
-    """Return the host of this name, or the only one running.
+    """Return the host with this name, or the only host that is running.
 
     Raises:
-        UsageError: None runs, or several do and no name is given.
-        UnknownNameError: None of this name runs.
+        UsageError: No host is running, or several are and no name is given.
+        UnknownNameError: No host with this name is running.
     """
     running = running_hosts(group)
     if name is not None:
@@ -351,8 +351,8 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
 
     Raises:
         UsageError, RefusedError: Nothing was done; the message says why.
-        LinkError: It can't be reached, or ended meanwhile.
-        NoAnswerError: It did not answer in time.
+        LinkError: The host can't be reached, or ended in the meantime.
+        NoAnswerError: The host did not answer in time.
     """
     directory = find_directory(group, HOST)
     try:
@@ -363,7 +363,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
     received = bytearray()
     try:
-        with suppress(BrokenPipeError):  # a refused caller gets its answer before it has sent the request
+        with suppress(BrokenPipeError):  # a refused caller gets its answer before it has sent its whole request
             _send(sock, encode_handed(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet

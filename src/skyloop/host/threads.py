@@ -1,4 +1,4 @@
-"""Threads shared by many proxies: one ticks them, some serve their requests, and one watches for loops that hang."""
+"""Threads shared by many proxies: one ticks them, some serve their requests, and a watchdog detects loops that hang."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from skyloop.clock import beats
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
-#: Failed ticks in a row, half a second of them, after which a proxy counts as failed: it no longer has a failsafe.
+#: Failed ticks in succession (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Rounds between those in which a proxy does everything: ten times a second.
+#: A proxy does everything once in this many rounds, which is ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called with a proxy whose ticks fail, and the last error, on the ticker's thread; must return at once.
+#: Called on the ticker's thread with a proxy whose ticks fail and the last error; must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
-MAX_THREADS: Final = 64  #: drivers that may hang in a request before others have to wait
-IDLE_THREADS: Final = 2  #: threads kept for bursts of requests
-_IDLE_S: Final = 5.0  #: after this time without a job, a spare thread ends
+MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
+IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
+_IDLE_S: Final = 5.0  #: a spare thread without a job ends after this time
 
 Job = Callable[[], None]
-CHECK_S: Final = 0.05  #: between two checks
-STALL_CHECKS: Final = 5  #: 0.25 s: other vehicles get a new thread before their pilots' silence makes them hover
-HANG_CHECKS: Final = 40  #: 2 s: drop the vehicle
+CHECK_S: Final = 0.05  #: interval between checks
+STALL_CHECKS: Final = 5  #: 0.25 s: gives other vehicles a new thread before their pilots' silence makes them hover
+HANG_CHECKS: Final = 40  #: 2 s: the vehicle is dropped
 
 
 class Ticker:
-    """Ticks proxies on one thread, from its construction to :meth:`close`. A failed tick does not affect other proxies.
+    """Ticks proxies on one thread, from construction to :meth:`close`. A failed tick does not affect other proxies.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it runs, and can be split.
+    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
 
     Args:
-        on_failing: Called for a proxy after :data:`MAX_FAILURES` failed ticks in a row.
+        on_failing: Called for a proxy after :data:`MAX_FAILURES` failed ticks in succession.
         proxies: The initial proxies.
     """
 
     def __init__(self, on_failing: OnFailing, proxies: Iterable[Proxy] = ()) -> None:
-        self.inside: Proxy | None = None  #: the proxy being ticked
+        self.inside: Proxy | None = None  #: the proxy currently being ticked
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
-        self._failures = dict.fromkeys(proxies, 0)  # in a row, by proxy
-        self._lock = threading.Lock()  # guards whose code is running
+        self._failures = dict.fromkeys(proxies, 0)  # number of failures in succession, by proxy
+        self._lock = threading.Lock()  # guards the knowledge of whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -57,17 +57,17 @@ class Ticker:
             self._failures[proxy] = 0
 
     def remove(self, proxy: Proxy) -> bool:
-        """Stop ticking a proxy; return whether it was ticked here. Any thread. A tick in progress continues."""
+        """Stop ticking a proxy; return whether it was ticked here. A tick in progress continues. Any thread."""
         with self._lock:
             return self._failures.pop(proxy, None) is not None
 
     @property
     def empty(self) -> bool:
-        """Whether it ticks no proxy."""
+        """Whether there is no proxy to tick."""
         return not self._failures
 
     def split(self, stuck: Proxy) -> Ticker:
-        """Leave this ticker to one proxy, and return a new one for all others. Any thread."""
+        """Leave this ticker to one proxy; return a new one for all other proxies. Any thread."""
         with self._lock:
             others = [proxy for proxy in self._failures if proxy is not stuck]
             for proxy in others:
@@ -84,9 +84,9 @@ class Ticker:
         for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
-            for place, proxy in enumerate(proxies, rounds):  # a fifth per round, to spread the work
+            for place, proxy in enumerate(proxies, rounds):  # a fifth of them per round, to spread the work
                 failures = self._failures.get(proxy)
-                if failures is not None:  # another ticker has not taken it over
+                if failures is not None:  # no other ticker has taken it over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
 
@@ -120,20 +120,20 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads, one per concurrent request, for the job queues of proxies.
+    """A pool of daemon threads for the job queues of proxies, with one thread per concurrent request.
 
-    A job that hangs holds up only its own queue.
+    A job that hangs delays only its own queue.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._ready: deque[PooledJobQueue] = deque()  # with a job not yet started
+        self._ready: deque[PooledJobQueue] = deque()  # queues with a job that has not been started
         self._idle = 0
         self._threads = 0
         self._closed = False
 
     def queue(self) -> PooledJobQueue:
-        """Return one proxy's job queue."""
+        """Return the job queue for one proxy."""
         return PooledJobQueue(self)
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class RequestWorkers:
             self._changed.notify_all()
 
     def schedule(self, jobs: PooledJobQueue) -> None:
-        """Have a thread do the queue's next job. Called by job queues."""
+        """Have a thread do the next job in a queue. Called by job queues."""
         with self._changed:
             self._ready.append(jobs)
             if self._idle >= len(self._ready):
@@ -171,7 +171,7 @@ class RequestWorkers:
 
 
 class PooledJobQueue:
-    """One proxy's jobs: a :class:`skyloop.proxy.requests.JobQueue` on the threads of a pool."""
+    """One proxy's jobs: a :class:`skyloop.proxy.requests.JobQueue` that runs on a pool's threads."""
 
     def __init__(self, workers: RequestWorkers) -> None:
         self._workers = workers
@@ -195,14 +195,14 @@ class PooledJobQueue:
         self._workers.schedule(self)
 
     def stop(self, timeout_s: float) -> None:
-        """Wait for the job in progress, up to this long [s]; drop the others."""
+        """Wait up to this long [s] for the job in progress; drop the others."""
         with self._changed:
             self._stopped = True
             self._jobs.clear()
             self._changed.wait_for(lambda: not self._busy, timeout_s)
 
     def do_one(self) -> None:
-        """Do the next job. For the pool's threads."""
+        """Do the next job. Called by the pool's threads."""
         with self._changed:
             job = self._jobs.popleft() if self._jobs else None
         if job is not None:
@@ -221,7 +221,7 @@ class SharedLoop(Protocol):
 
     @property
     def inside(self) -> Any:
-        """Whose code is running now; None if none."""
+        """Whose code is currently running; None if there is none."""
 
     @property
     def entries(self) -> int:
@@ -229,7 +229,7 @@ class SharedLoop(Protocol):
 
     @property
     def empty(self) -> bool:
-        """Whether it serves no vehicle."""
+        """Whether there is no vehicle to serve."""
 
     def close(self) -> None:
         """End the thread unless it is stuck."""
@@ -238,13 +238,13 @@ class SharedLoop(Protocol):
 class Watchdog:
     """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
-    It counts its own checks rather than time: on a suspended or overloaded machine, no loop hangs merely because time
-    has passed.
+    It counts its own checks rather than time, so that a loop on a suspended or overloaded machine is not considered
+    hung merely because time has passed.
 
     Args:
         loops: Returns the loops.
-        on_stall: Called with a loop and its stuck member, once per call that does not return.
-        on_hang: Called with the same if the call still has not returned.
+        on_stall: Called with a loop and its stuck member, once for each call that does not return.
+        on_hang: Called with the same arguments if the call still has not returned.
     """
 
     def __init__(
@@ -256,7 +256,7 @@ class Watchdog:
         self._loops = loops
         self._on_stall = on_stall
         self._on_hang = on_hang
-        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and number of checks that found them unchanged
+        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and number of checks without a change
         self._checked_s = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-watchdog", daemon=True)

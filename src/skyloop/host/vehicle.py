@@ -1,4 +1,4 @@
-"""One vehicle of a host: its proxy on this process's shared threads, or in a separate process."""
+"""One vehicle on a host: its proxy runs on this process's shared threads, or in a separate process."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ _log = logging.getLogger(__name__)
 
 
 class Condition(StrEnum):
-    """State of a vehicle's proxy."""
+    """The state of a vehicle's proxy."""
 
     STOPPED = "stopped"  #: not started yet, or removed
     STARTING = "starting"
     RUNNING = "running"
-    RESTARTING = "restarting"  #: its own process died and restarts after a pause
+    RESTARTING = "restarting"  #: its own process died and will restart after a pause
     FAILED = "failed"
 
 
 class VehicleStatus(msgspec.Struct, frozen=True):
-    """One row of ``skyloop host status``."""
+    """One row in ``skyloop host status``."""
 
     name: str
     address: str
@@ -59,19 +59,19 @@ class VehicleStatus(msgspec.Struct, frozen=True):
     battery: float | None = None
     uptime_s: float = 0.0
     failed: str = ""  #: why it failed, or why its process last ended
-    process: str = "shared"  #: or ``own``
+    process: str = "shared"  #: ``shared`` or ``own``
     pid: int | None = None
     restarts: int = 0
     airborne: bool = False
 
 
 class HostedVehicle(ABC):
-    """A vehicle of a host. Methods may be called from any thread."""
+    """A vehicle on a host. Methods may be called from any thread."""
 
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
         self.condition = Condition.STOPPED
-        self.failed = ""  #: the reason, once failed
+        self.failed = ""  #: the reason, if it has failed
         self.started_s = time.monotonic()
 
     @abstractmethod
@@ -80,7 +80,7 @@ class HostedVehicle(ABC):
 
     @abstractmethod
     def status(self) -> VehicleStatus:
-        """Return its row."""
+        """Return the vehicle's row."""
 
     @abstractmethod
     def end(
@@ -91,19 +91,19 @@ class HostedVehicle(ABC):
         *,
         unless_flying: bool = False,
     ) -> bool:
-        """End its flight and its proxy, as :meth:`skyloop.proxy.Proxy.end` does. Idempotent.
+        """End the vehicle's flight and its proxy, like :meth:`skyloop.proxy.Proxy.end`. Idempotent.
 
         Returns:
-            Whether its proxy has ended; with ``unless_flying``, that needs a landing in time.
+            Whether the proxy has ended; with ``unless_flying``, only if the vehicle landed in time.
         """
 
     @property
     def runs(self) -> bool:
-        """Return whether it has a proxy, or is about to have one."""
+        """Return whether it has a proxy or is about to have one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
-        """Return the row without its proxy's state."""
+        """Return the row without the proxy's state."""
         settings = self.settings
         up_s = time.monotonic() - self.started_s if self.condition is Condition.RUNNING else 0.0
         process = "own" if settings.own_process else "shared"
@@ -116,13 +116,13 @@ class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
     Args:
-        settings: Its settings.
-        reactor: Receives its local packets.
-        jobs: Serves its slow requests.
-        network: How its proxy joins the network; None for this host only.
-        make: Creates an address's driver.
-        overview: The rows of all vehicles of this process; None: its own row only.
-        serve_link: Moves a driver's link to a shared thread; None: the link has its own.
+        settings: The vehicle's settings.
+        reactor: Receives the vehicle's local packets.
+        jobs: Serves the vehicle's slow requests.
+        network: How the proxy joins the network; None for this host only.
+        make: Creates the driver for an address.
+        overview: Returns the rows of all vehicles in this process; None: only its own row is shown.
+        serve_link: Moves a driver's link to a shared thread; None: the link keeps its own.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class SharedVehicle(HostedVehicle):
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
-        self._settled = threading.Event()  # it runs, or has failed to start
+        self._settled = threading.Event()  # set when it runs or has failed to start
 
     def start(self) -> None:
         try:
@@ -190,14 +190,14 @@ class SharedVehicle(HostedVehicle):
         return msgspec.structs.replace(row, **of_proxy(proxy))
 
     def report_stall(self, seconds: float) -> None:
-        """Publish that its driver blocks, and that it no longer shares its threads."""
+        """Publish that the driver blocks and that the vehicle no longer shares its threads."""
         proxy = self.proxy
         if proxy is not None:
             text = f"the driver has been blocking for {seconds:g} s: its vehicle no longer shares its threads"
             proxy.publisher.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="host")
 
     def fail(self, reason: str) -> bool:
-        """End a vehicle whose driver hangs or fails, with an event; return False if it was not running."""
+        """End a vehicle whose driver hangs or fails, and publish an event; return False if it was not running."""
         with self._life:
             proxy = self.proxy
             if proxy is None or self.condition is not Condition.RUNNING:
@@ -215,7 +215,7 @@ class SharedVehicle(HostedVehicle):
         unless_flying: bool = False,
     ) -> bool:
         if self.condition is not Condition.STOPPED:
-            self._settled.wait(OPEN_S + 1.0)  # else it would start to serve after its removal
+            self._settled.wait(OPEN_S + 1.0)  # otherwise it might start to serve after its removal
         proxy = self.proxy
         if proxy is not None and self.condition is Condition.RUNNING:
             patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)
@@ -232,7 +232,7 @@ class SharedVehicle(HostedVehicle):
 
 
 def of_proxy(proxy: Proxy) -> dict[str, object]:
-    """Return a running proxy's part of a row."""
+    """Return the part of a row that a running proxy provides."""
     vehicle = proxy.publisher
     feedback = vehicle.feedback_now
     return {
@@ -250,7 +250,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
     """Return how a vehicle's proxy joins the network; None for this host only.
 
     Raises:
-        UsageError: An address or the key folder is not valid.
+        UsageError: An address or the key folder is invalid.
         MissingExtraError: The extra ``network`` is not installed.
     """
     if settings.network is None:
@@ -262,10 +262,10 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 
 def within(call: Callable[[], object], seconds: float) -> bool:
-    """Call something that may hang on a separate thread, and raise its exceptions.
+    """Run something that may hang on a separate thread, and raise its exceptions here.
 
     Returns:
-        Whether it returned in time; if not, its daemon thread keeps running.
+        Whether the call returned in time. If not, its daemon thread keeps running.
     """
     raised: list[BaseException] = []
 
@@ -284,5 +284,5 @@ def within(call: Callable[[], object], seconds: float) -> bool:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the text of an error, for people."""
+    """Return an error's text for users."""
     return str(error) if isinstance(error, SkyloopError) else repr(error)

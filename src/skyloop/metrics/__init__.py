@@ -1,6 +1,6 @@
-"""Metrics of proxies, the cockpit and routers for Prometheus: collected on each scrape, never on a sample's path.
+"""Metrics of proxies, the cockpit and routers for Prometheus, collected only when scraped, never on a sample's path.
 
-Any thread can read them; reading takes no lock that a command waits for. Needs the extra ``metrics``.
+They can be read on any thread, without taking any lock that a command waits for. Needs the extra ``metrics``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Metrics that are counters of the proxy: absent ones are 0, except those of a network that is not served.
+#: Metrics that are counters in the proxy. Absent ones are 0, except those of a network that is not served.
 _COUNTERS: Final = {
     "skyloop_feedback_published_total": "feedback.published",
     "skyloop_feedback_selected_total": "feedback.selected",
@@ -43,7 +43,7 @@ _NETWORK: Final = {
     "skyloop_network_strays_total": "network.strays",
     "skyloop_network_turned_away_total": "network.turned_away",
 }
-#: Counters with a label in their name: the parts before and after it.
+#: Counters whose name contains a label: the parts of the name before and after it.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
     "skyloop_events_total": ("events.of.", ""),
@@ -70,14 +70,14 @@ __all__ = [
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
-    """Serve the metrics of the proxies of this process.
+    """Serve the metrics of this process's proxies.
 
     Args:
         proxies: Returns the current proxies; called on the endpoint's thread for each scrape.
         where: ``[HOST:]PORT``; see :func:`serve`.
 
     Raises:
-        UsageError: ``where`` is not an address, or can't be listened on.
+        UsageError: ``where`` is not an address, or listening on it failed.
         MissingExtraError: The extra ``metrics`` is not installed.
     """
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
@@ -90,7 +90,7 @@ def serving_beside(
 
     Args:
         where: ``[HOST:]PORT``; see :func:`serve`.
-        announce: Called with a line for people that says where the metrics are.
+        announce: Called with a line of text that tells users where the metrics are.
     """
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
@@ -102,7 +102,7 @@ def serving_beside(
 
 
 def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
-    """Yield all metrics of one proxy, its vehicle and its applications."""
+    """Yield all metrics about one proxy, its vehicle and its applications."""
     name, now_ns, publisher, handler = proxy.name, proxy.clock(), proxy.publisher, proxy.handler
     own = (name,)
     yield Reading("skyloop_vehicle_info", 1.0, (name, proxy.capabilities.vehicle))
@@ -143,11 +143,11 @@ def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
 
 
 def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
-    """Yield a client's metrics of its connection to one proxy, without a request to the proxy."""
+    """Yield a client's metrics about its connection to one proxy, without querying the proxy."""
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
     for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
-            continue  # pages create any number of video streams, and an observer sends no commands
+            continue  # pages open any number of video streams, and an observer sends no commands
         labels = (name, channel)
         yield Reading("skyloop_client_received_total", float(stats.count), labels)
         yield Reading("skyloop_client_lost_total", float(stats.lost), labels)
@@ -161,7 +161,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
 
 
 def router_readings(session: Callable[[], Session]) -> Source:
-    """Return the source of a router's readings."""
+    """Return the source of a router's metrics."""
 
     def read() -> Iterator[Reading]:
         current = session()

@@ -1,6 +1,6 @@
-"""All metrics, as ``docs/operations.md`` lists them, and the HTTP endpoint for Prometheus.
+"""All metrics, as listed in ``docs/operations.md``, and the HTTP endpoint for Prometheus.
 
-The endpoint has its own threads: a slow or stalled reader delays nothing else.
+The endpoint has its own threads, so a slow or stalled reader delays nothing else.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Kind = Literal["gauge", "counter", "info"]
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One metric, with all its labels. Names follow OpenMetrics: base units, ``_total`` for counters."""
+    """One metric with all its labels. Names follow OpenMetrics: base units, ``_total`` for counters."""
 
     name: str
     kind: Kind
@@ -43,7 +43,7 @@ class Reading(NamedTuple):
 
     name: str
     value: float
-    labels: tuple[str, ...] = ()  #: in the order of the family's labels
+    labels: tuple[str, ...] = ()  #: label values, in the order of the family's labels
 
 
 _VEHICLE: Final = ("vehicle",)
@@ -146,12 +146,12 @@ FAMILIES: Final[dict[str, Family]] = {
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
 MAX_SCRAPES: Final = 8  #: at a time; a further connection closes the one that has waited longest without a request
-ANSWER_S: Final = 1.0  #: a scrape is never closed for a new connection before this time
-DEADLINE_S: Final = 10.0  #: longest duration of a connection, from its first byte to its last
-_POLL_S: Final = 0.1  # how often the server thread checks whether to stop
+ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
+DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
+_POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop
 _log = logging.getLogger(__name__)
 
-#: Reads the values of one thing now.
+#: Reads the current values of one source.
 Source = Callable[[], Iterable[Reading]]
 
 
@@ -159,9 +159,9 @@ def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: fl
     """Serve metrics over HTTP until the endpoint is closed.
 
     Args:
-        sources: Returns the sources; it and they are called on the endpoint's threads for each scrape.
-        where: ``[HOST:]PORT``; the host defaults to 127.0.0.1, and port 0 takes a free one.
-        deadline_s: How long a connection may take [s]; at most :data:`MAX_SCRAPES` are open at a time.
+        sources: Returns the sources. Like each source, it is called on the endpoint's threads for each scrape.
+        where: ``[HOST:]PORT``; the host defaults to 127.0.0.1, and port 0 picks a free one.
+        deadline_s: Maximum duration of a connection [s]; at most :data:`MAX_SCRAPES` are open at a time.
 
     Raises:
         UsageError: ``where`` is not an address, or can't be listened on.
@@ -171,7 +171,7 @@ def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: fl
 
 
 def parse_where(where: str) -> tuple[str, int]:
-    """Return host and port of ``[HOST:]PORT``; IPv6 addresses are in brackets.
+    """Return host and port from ``[HOST:]PORT``; IPv6 addresses are in brackets.
 
     Raises:
         UsageError: The text has another form.
@@ -183,10 +183,10 @@ def parse_where(where: str) -> tuple[str, int]:
 
 
 class Endpoint:
-    """Metrics over HTTP, created by :func:`serve`; a context manager that closes it."""
+    """Serves metrics over HTTP. Created by :func:`serve`; a context manager that closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
-        """Listen and answer from now on; see :func:`serve`."""
+        """Start listening and answering; see :func:`serve`."""
         self._server = _Server(where, _registry(sources), deadline_s)
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(_POLL_S,), name="skyloop-metrics", daemon=True
@@ -200,13 +200,13 @@ class Endpoint:
 
     @property
     def url(self) -> str:
-        """Address of the metrics for Prometheus."""
+        """The URL of the metrics, for Prometheus."""
         host = str(self._server.server_address[0])
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{PATH}"
 
     @property
     def announcement(self) -> str:
-        """A line for people: where the metrics are and who can read them."""
+        """A line that tells users where the metrics are and who can read them."""
         open_to = "" if self._server.own else " (WARNING: anyone who reaches this address can read them)"
         return f"metrics: {self.url}{open_to}"
 
@@ -226,9 +226,9 @@ class Endpoint:
 
 
 class Collector:
-    """Reads all sources on request, in the format of ``prometheus_client``.
+    """Reads all sources on request, in the form that ``prometheus_client`` expects.
 
-    A source that fails is skipped, counted and logged; the others are still served.
+    If a source fails, it is skipped, counted and logged; the others are still served.
     """
 
     def __init__(self, sources: Callable[[], Iterable[Source]]) -> None:
@@ -264,7 +264,7 @@ class Collector:
                 with self._lock:
                     self._errors += 1
                 _log.exception("metrics can't be read")
-            time.sleep(0)  # lets a thread with a command go first
+            time.sleep(0)  # lets a thread that has a command go first
         yield Reading("skyloop_scrape_errors_total", float(self._errors))
 
 
@@ -298,10 +298,10 @@ class _Server(ThreadingHTTPServer):
         self.own = is_loopback(str(self.server_address[0]))
         self._deadline_s = deadline_s
         self._lock = threading.Lock()
-        self._open: dict[Any, float] = {}  # connections, each protected until a time; oldest first
+        self._open: dict[Any, float] = {}  # connections, each protected until a given time; oldest first
 
     def server_bind(self) -> None:
-        # Not HTTPServer's, which looks up this machine's name on the network.
+        # HTTPServer's own method looks up this machine's name on the network.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -324,13 +324,13 @@ class _Server(ThreadingHTTPServer):
             self.shutdown_request(request)
 
     def asked(self, request: Any) -> None:
-        """Note that a connection has sent a whole request."""
+        """Record that a connection has sent a complete request."""
         with self._lock:
             if request in self._open:
                 self._open[request] = time.monotonic() + ANSWER_S
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        # Limit the whole connection: with a limit per read, a byte now and then could hold it forever.
+        # Limit the whole connection: with a limit per read, a byte every now and then could keep it open forever.
         guard = threading.Timer(self._deadline_s, _hang_up, (request,))
         guard.daemon = True
         guard.start()
@@ -353,7 +353,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.server.asked(self.connection)
         if self.server.own and not _names_loopback(self.headers.get("Host", "")):
-            # DNS rebinding: a script of another site whose name resolves here could read the answer.
+            # DNS rebinding: a script from another site, whose name resolves to this host, could read the answer.
             self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"use this machine's address\n")
         elif self.path.partition("?")[0] != PATH:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", f"the metrics are at {PATH}\n".encode())
@@ -375,7 +375,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _names_loopback(host: str) -> bool:
-    """Return whether a Host header names this machine's loopback, with any port."""
+    """Return whether a Host header names this machine's loopback address, with any port."""
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
     except ValueError:
@@ -383,5 +383,5 @@ def _names_loopback(host: str) -> bool:
 
 
 def _hang_up(request: socket.socket) -> None:
-    with suppress(OSError):  # already gone
+    with suppress(OSError):  # it is already gone
         request.shutdown(socket.SHUT_RDWR)

@@ -1,13 +1,13 @@
-"""Zenoh's access control, generated from a lab's roster; pure functions.
+"""Generate Zenoh's access control from a lab's roster. Pure functions.
 
-A node applies it on each of its links to the neighbour, identified by the common name in the neighbour's certificate.
-What that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward (egress), and
-nothing else passes. So each end protects itself, whatever the configuration of others. A router may publish and
-subscribe to everything, and applies the rules to its own neighbours; traffic through it is sealed, so that it cannot
-forge anything (:mod:`skyloop.network.sealing`).
+A node applies the rules to the neighbour on each of its links, identified by the common name in the neighbour's
+certificate. What that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward
+(egress), and everything else is blocked. Each end thus protects itself, regardless of how others are configured. A
+router may publish and subscribe to everything, and applies the rules to its own neighbours; traffic through it is
+sealed, so that it cannot forge anything (:mod:`skyloop.network.sealing`).
 
-The two directions mirror each other: what an application publishes, proxies subscribe to. Declarations and queries
-count as messages in the direction in which they travel: a subscriber's declaration is published.
+The two directions mirror each other: proxies subscribe to what applications publish, and vice versa. Declarations and
+queries count as messages in the direction in which they travel, so a subscriber's declaration counts as published.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _SUBSCRIBE: Final = ("declare_subscriber",)
 _ALL: Final = (*_PUT, "delete", *_SUBSCRIBE, *_QUERY, *_ANSWERS, *_TOKEN, *_LIFE)
 _ANY: Final = "*"
 
-#: Key expressions by kind of message.
+#: Key expressions for each kind of message.
 Rules = Mapping[tuple[str, ...], list[str]]
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for any node of a lab: only these identities may join."""
+    """Return Zenoh's ``access_control`` section for any node in a lab: only these identities may join."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -108,12 +108,12 @@ def may_subscribe(identity: Identity) -> Rules:
 
 
 def _to_applications(names: list[str]) -> list[str]:
-    """Return the keys on which proxies send packets and frames, and to which applications subscribe."""
+    """Return the keys on which proxies send packets and frames, and which applications subscribe to."""
     return [key for name in names for key in layout.downward(name)]
 
 
 def _to_proxies(identity: Identity, who: str) -> list[str]:
-    """Return the keys on which an application may send packets, or receive ``who``'s subscription to them."""
+    """Return the keys on which an application may send packets, or may receive ``who``'s subscription to them."""
     keys = [layout.upward(layout.ASK, name, who, _ANY) for name in _seen(identity)]
     if identity.role is KeyRole.PILOT:
         ways = (layout.ORDER, layout.COMMAND)
@@ -122,10 +122,10 @@ def _to_proxies(identity: Identity, who: str) -> list[str]:
 
 
 def _seen(identity: Identity) -> list[str]:
-    """Return the drones that an application may see; a pilot sees all, whichever it may fly."""
+    """Return the drones that an application may see. A pilot may see all drones, not only those it may fly."""
     return _chunks(ALL_DRONES if identity.role is KeyRole.PILOT else identity.drones)
 
 
 def _chunks(patterns: tuple[str, ...]) -> list[str]:
-    """Convert each pattern to one chunk of a key expression, where ``*`` is any name and ``$*`` any characters."""
+    """Convert each pattern to one chunk of a key expression, in which ``*`` is any name and ``$*`` any characters."""
     return [pattern if pattern == _ANY else pattern.replace("*", "$*") for pattern in patterns]

@@ -1,6 +1,6 @@
-"""Admission of applications that prove their identity with their keys, while there is room for them.
+"""Admit applications that prove their identity with their keys, as long as there is room for them.
 
-With the proofs, the two ends also agree on the keys that seal their packets.
+When they exchange these proofs, the two ends also agree on the keys that seal their packets.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity, KeyRing
 
-MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time of the thread that calls the handler
-#: Connections of one key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
+MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
+#: Connections per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
-#: Connections reserved for keys that may fly this drone: others can't lock pilots out, however many keys they have.
+#: Connections reserved for keys that may fly this drone, so that no number of other keys can lock pilots out.
 FOR_PILOTS: Final = 64
-#: Tokens remembered per key: a token arrives before its connection.
+#: Tokens remembered per key, because a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
-#: Without keys all have the same name, and a flood looks like many applications.
+#: Total limit without keys: all applications then have the same name, and a flood looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 
 class Admission(NamedTuple):
-    """The terms of a connection; without keys only ``welcome`` is set."""
+    """The terms of a connection; without keys, only ``welcome`` is set."""
 
     welcome: bytes = b""  #: the proxy's answer
-    offer: bytes = b""  #: the proof in the request
-    identity: Identity | None = None  #: the other end's proven identity
+    offer: bytes = b""  #: the proof contained in the request
+    identity: Identity | None = None  #: the proven identity of the other end
     expires: datetime | None = None  #: expiry of its key
-    sealer: Sealer = PLAIN  #: for packets to it
-    opener: Opener = PLAIN  #: for packets from it
-    topics: Opener = PLAIN  #: for published packets: the application's opener
+    sealer: Sealer = PLAIN  #: seals packets sent to the other end
+    opener: Opener = PLAIN  #: opens packets received from the other end
+    topics: Opener = PLAIN  #: opens published packets (in the application)
     generation: int = 0  #: generation of the topic key
 
 
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join, and return its terms with the proxy's answer; without keys everybody is admitted.
+    """Check a request to join; return its terms, including the proxy's answer. Without keys, everyone is admitted.
 
     Raises:
-        LinkError: The application has no key of this lab, another's key, or one that may not see this drone.
+        LinkError: The application has no key from this lab, someone else's key, or one that may not see this drone.
     """
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
@@ -69,7 +69,7 @@ def admit(
 
 
 class JoinRequest:
-    """The application's request to join, which accepts only the proxy's answer; without keys, any answer."""
+    """An application's request to join. With keys, only the intended proxy's answer is accepted; without, any is."""
 
     def __init__(self, ring: KeyRing | None, name: str, run: str, sender: layout.Sender) -> None:
         self._name = name
@@ -82,10 +82,10 @@ class JoinRequest:
             self.proof = self._agreement.offer()
 
     def accept(self, welcome: packets.Welcome) -> Admission:
-        """Check the proxy's answer, and return the terms of the connection.
+        """Check the proxy's answer and return the terms of the connection.
 
         Raises:
-            LinkError: The answer comes from an end without a key to serve this drone, or is damaged.
+            LinkError: The answer is damaged, or its sender has no key to serve this drone.
         """
         if not self.proof:
             return Admission()
@@ -112,12 +112,12 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no room for one more connection; empty if there is.
+    """Return why there is no room for another connection; empty if there is room.
 
     Args:
-        who: The identity that requests it.
-        may_fly: Whether it may fly this drone.
-        present: The present connections: the identity of each, and whether it may fly this drone.
+        who: The identity that requests the connection.
+        may_fly: Whether that identity may fly this drone.
+        present: The current connections, each given by its identity and whether that may fly this drone.
     """
     here = list(present)
     own = sum(other == who for other, _ in here)
@@ -135,14 +135,14 @@ def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]
 
 
 class Tokens:
-    """The liveliness tokens of connections, limited per identity, or in total without keys. Not thread-safe."""
+    """The liveliness tokens of connections, limited per identity or, without keys, in total. Not thread-safe."""
 
     def __init__(self, *, by_key: bool) -> None:
         self._most = TOKENS_PER_KEY if by_key else TOKENS
         self._seen: dict[str, set[str]] = {}
 
     def add(self, who: str, connection: str) -> bool:
-        """Add a token; return False if this identity has too many."""
+        """Add a token; return False if the identity has too many."""
         seen = self._seen.setdefault(who, set())
         if len(seen) >= self._most and connection not in seen:
             return False
@@ -158,9 +158,9 @@ class Tokens:
                 del self._seen[who]
 
     def has(self, who: str, connection: str) -> bool:
-        """Return whether a connection has a token."""
+        """Return whether there is a token for a connection."""
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:
-        """Return whether any of these connections, given with their identities, has a token."""
+        """Return whether there is a token for any of these connections, given with their identities."""
         return any(self.has(who, connection) for connection, who in connections.items())

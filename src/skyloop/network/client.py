@@ -1,4 +1,4 @@
-"""An application's end of the fabric transport."""
+"""The application's end of the fabric transport."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ from skyloop.transport.base import (
 if TYPE_CHECKING:
     import zenoh
 
-GLANCE_S: Final = 0.25  #: time for one session to find a proxy before searching elsewhere
-#: After a loss, a linked node that takes longer to list its proxies has probably not seen that the links ended before
-#: they were re-established. It takes the new links for more of the old ones and announces nothing on them. The limit
-#: doubles each time, up to :data:`SYNC_S`, as the node may only be busy.
+GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
+#: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
+#: ended before they were re-established: it then takes the new links for additional ones and announces nothing on them.
+#: The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
-POLL_S: Final = 0.05  #: how often to check for packets to resend
-STALLED_S: Final = 5.0  #: a proxy that acknowledges nothing for this long counts as gone
-KEYS_S: Final = 0.5  #: how often to check for a newer roster
-FAREWELL_S: Final = 0.3  #: how long to wait for the answer to a bye
+POLL_S: Final = 0.05  #: interval between checks for packets to resend
+STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
+KEYS_S: Final = 0.5  #: interval between checks for a newer roster
+FAREWELL_S: Final = 0.3  #: time to wait for an answer to a bye
 _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return the dialer of a proxy on the network.
+    """Return a dialer for a proxy on the network.
 
-    The dialer raises :class:`UnknownNameError` if no such proxy can be reached, and :class:`LinkError` if the proxy
-    does not admit the application.
+    The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
+    proxy does not admit the application.
 
     Args:
         name: The proxy's name.
         settings: How to join the network; by default by multicast, without keys.
-        find_s: Time for each call of the dialer to find the proxy [s].
+        find_s: Time allowed to find the proxy in each call of the dialer [s].
 
     Raises:
-        UsageError: The name is not valid, or the keys are not an application's.
+        UsageError: The name is invalid, or the keys are not those of an application.
         MissingExtraError: The extra ``network`` is not installed.
     """
     check_name(name)
@@ -72,7 +72,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the other while the other has not: such a session finds no proxy, or gets no
+            # One end may have forgotten the other, but not vice versa. Such a session finds no proxy or gets no
             # answers, and Zenoh does not notice. A new session has a new identity.
             retire(before.session)
             before = None
@@ -83,7 +83,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             renew(session)
             release(session)
             raise
-        except NoAnswerError:  # as above: the links may have been re-established since the session was opened
+        except NoAnswerError:  # the same cause: the links may have been re-established since the session was opened
             list_s = min(2.0 * list_s, SYNC_S)
             retire(session)
             release(session)
@@ -107,24 +107,24 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     return dialer
 
 
-#: For the receiving thread: a packet of a topic (None: for this end only) and its number; empty: a frame.
+#: For the receiving thread: a packet of a topic (None: for this end only; empty: a frame) and its number.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
 
 class FabricClient(TransportClient):
-    """An application's end, made by :func:`dial`'s dialer.
+    """The application's end, created by the dialer from :func:`dial`.
 
     Args:
-        session: The Zenoh session; released when the connection ends, but not if this raises.
+        session: The Zenoh session; released when the connection ends, but not if the constructor raises.
         name: The proxy's name.
         handler: Called on the receiving thread.
-        find_s: Time to find the proxy [s].
-        list_s: Further time for linked nodes to list the proxies that they know [s].
-        known: An earlier report of the proxy about itself.
+        find_s: Time allowed to find the proxy [s].
+        list_s: Additional time for linked nodes to list the proxies that they know [s].
+        known: The proxy's description of itself, if received earlier.
 
     Raises:
-        UnknownNameError: No such proxy can be reached.
+        UnknownNameError: No proxy with this name can be reached.
         LinkError: The proxy does not admit this application, or does not answer (:class:`NoAnswerError`).
     """
 
@@ -138,17 +138,17 @@ class FabricClient(TransportClient):
         known: packets.ProxyInfo | None = None,
     ) -> None:
         self._session = session
-        self.parted = False  #: the proxy has announced the end of this connection, or accepted it
+        self.parted = False  #: whether the proxy has announced or accepted the end of this connection
         self._name = name
         self._handler = handler
         self._who = session.settings.who
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # the proxy's, once a proxy was asked to admit us
-        self._lock = threading.Lock()  # guards what follows; held while sending, to keep packets in order
+        self._run = ""  # the proxy's run, set once a proxy was asked to admit us
+        self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with the declarations of each
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with the declarations for each
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None
@@ -156,17 +156,17 @@ class FabricClient(TransportClient):
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
         self._keys_s = 0.0  # when to check the keys next
-        self._admission = Admission()  # with keys: the proxy's identity and the seals of packets
-        self.forged = 0  #: packets and frames that were not the proxy's
+        self._admission = Admission()  # with keys: the proxy's identity, and seals for the packets
+        self.forged = 0  #: number of packets and frames that did not come from the proxy
         self._receiver = Receiver()  # packets for this end only
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
-        self._ended = False  # nothing can be sent any more
-        self._closing = False  # closed here: nothing more is delivered
-        self._farewell = threading.Event()  # the proxy has answered our bye, or is gone
+        self._ended = False  # nothing more can be sent
+        self._closing = False  # closed by this end: nothing more is delivered
+        self._farewell = threading.Event()  # set when the proxy has answered our bye, or is gone
         self._reason = ""
         self._held: list[Any] = []
         try:
-            about = self.about = self._enter(find_s, list_s, known)  #: the proxy's report about itself, if any
+            about = self.about = self._enter(find_s, list_s, known)  #: the proxy's description of itself, if known
         except BaseException:
             self._undeclare()
             raise
@@ -177,9 +177,7 @@ class FabricClient(TransportClient):
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
         """Find the proxy and join it.
 
-        Raises:
-            LinkError: It does not admit us.
-            UnknownNameError: There is none.
+        Raises: LinkError: The proxy does not admit us. UnknownNameError: There is no such proxy.
         """
         session, name = self._session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone, known)
@@ -234,7 +232,7 @@ class FabricClient(TransportClient):
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
-        if not sent:  # the next connection subscribes again; on this one, nothing would arrive
+        if not sent:  # nothing would arrive on this connection; the next one subscribes again
             self._end(f"the proxy accepts no packets: the subscription to {topic!r} can't be sent")
 
     def close(self) -> None:
@@ -244,7 +242,7 @@ class FabricClient(TransportClient):
 
     @property
     def session(self) -> Session:
-        """The Zenoh session, which other connections may share."""
+        """The Zenoh session, which may be shared with other connections."""
         return self._session
 
     @property
@@ -284,7 +282,7 @@ class FabricClient(TransportClient):
         )
 
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost and that nothing waits for."""
+        """Send a packet that may be lost and that nobody waits for."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)
@@ -293,7 +291,7 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet until it is acknowledged; return False if there is no room for it. Call with the lock held."""
+        """Send a packet until it is acknowledged; return False if there is no room for it. The lock must be held."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False
@@ -303,7 +301,7 @@ class FabricClient(TransportClient):
         return True
 
     def _send_due(self) -> None:
-        """Send the packets that are due. Call with the lock held."""
+        """Send the packets that are due. The lock must be held."""
         for number, packet, way in self._outgoing.due(time.monotonic()):
             self._put(way, packet, number)
 
@@ -333,11 +331,11 @@ class FabricClient(TransportClient):
             self._end("the proxy is gone")
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet for this application only."""
+        """Handle a packet sent to this application only."""
         try:
             opened = contents(self._admission.opener, sample)
             if opened is None:
-                return  # it already arrived on another path
+                return  # already received on another path
             packet, number = opened[0], packets.parse_number(opened[1])
         except DecodeError as error:
             self._reject(error)
@@ -361,7 +359,7 @@ class FabricClient(TransportClient):
             self._enqueue(packet)
 
     def _control(self, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False for one left to the handler (garbage)."""
+        """Handle one of the transport's own packets; return False if it is left to the handler (garbage)."""
         if isinstance(message, packets.Taken):
             with self._lock:
                 self._outgoing.taken(message.number, time.monotonic())
@@ -380,7 +378,7 @@ class FabricClient(TransportClient):
         self._inbox.put((subscription, packet, number))
 
     def _reject(self, error: DecodeError) -> None:
-        """Count a sample that is not the proxy's, and log the first."""
+        """Count a sample that did not come from the proxy; log the first one."""
         self.forged += 1
         if self.forged == 1:
             _log.warning("%s: ignored a packet that the proxy did not send: %s", self._name, error)
@@ -388,7 +386,7 @@ class FabricClient(TransportClient):
     # --- keys ---
 
     def _check_keys(self) -> None:
-        """End the connection if a newer roster excludes the proxy or a linked node. On the receiving thread."""
+        """End the connection if a newer roster excludes the proxy or a linked node. Called on the receiving thread."""
         ring, proxy, expires = self._ring, self._admission.identity, self._admission.expires
         now_s = time.monotonic()
         if ring is None or proxy is None or now_s < self._keys_s:
@@ -407,24 +405,24 @@ class FabricClient(TransportClient):
             reason = f"linked to a node whose keys were revoked or changed: {', '.join(sorted(linked))}"
         else:
             return
-        retire(self._session)  # the next session uses the newer roster
+        retire(self._session)  # the next session will use the newer roster
         self._end(reason)
 
     # --- the end of the connection ---
 
     def _end(self, reason: str) -> None:
-        """End the connection once; the receiving thread does the rest. Any thread."""
+        """End the connection, once; the receiving thread does the rest. Any thread."""
         with self._lock:
             if self._ended:
                 return
             self._reason = self._reason or reason
-            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # after all that was sent before
+            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # sent after everything that was sent before
                 self._put(layout.ASK, packets.bye(reason), 0)
             self._ended = True
         self._inbox.put(None)
 
     def _undeclare(self) -> None:
-        """Undeclare everything. Not on Zenoh's threads."""
+        """Undeclare everything. Must not be called on Zenoh's threads."""
         held, self._held = self._held, []
         for _, declared in self._subscriptions.values():
             held += declared
@@ -456,7 +454,7 @@ class FabricClient(TransportClient):
             _log.exception("the handler of %s failed in closed()", self._address)
 
     def _next(self) -> _Item | None:
-        """Return the next item; while waiting, resend packets to the proxy and check the keys."""
+        """Return the next item. While waiting, resend packets to the proxy and check the keys."""
         while True:
             self._check_keys()
             with self._lock:
@@ -479,7 +477,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet; ``once``: with a datagram, which may be lost."""
+        """Acknowledge a packet; with ``once``, by a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return

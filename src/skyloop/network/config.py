@@ -1,6 +1,6 @@
-"""Network settings from arguments and the environment, and the Zenoh configuration made from them.
+"""Read network settings from arguments and the environment, and create Zenoh's configuration from them.
 
-Pure except for reading the environment and searching for a free port.
+Pure, except for reading the environment and finding a free port.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from skyloop.network.layout import ANYONE, check_identity
 if TYPE_CHECKING:
     from skyloop.network.keys import Credentials, Identity, KeyRing
 
-LEASE_S: Final = 0.7  #: default time without a sign of life after which a peer counts as gone
-MAX_LEASE_S: Final = 10.0  #: longest lease
-DEFAULT_PORT: Final = 7447  #: Zenoh's
-#: Time for an address to answer before the next one of the same peer is tried.
+LEASE_S: Final = 0.7  #: default time without a sign of life after which a peer is considered gone
+MAX_LEASE_S: Final = 10.0  #: longest lease that can be set
+DEFAULT_PORT: Final = 7447  #: Zenoh's default port
+#: Time for an address to answer before the peer's next address is tried.
 OPEN_MS: Final = 800
-#: The same for given addresses: all are tried at once, and a mobile network may be behind one, where each answer after
-#: an outage waits behind old video. An end that gives up just before the last answer leaves a half-open link at the far
-#: end; Zenoh takes the next link for a second one of the same peer, and repeats no declarations on it.
+#: The same for addresses given explicitly: all are tried at once, and one may lead to a mobile network, where answers
+#: after an outage are stuck behind old video. An end that gives up just before the last answer leaves a half-open link
+#: at the far end; Zenoh takes the next link for a second one to the same peer and does not repeat declarations on it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits to discover others (Zenoh's default). An application with one address waits only for
-#: its proxy; with several it must find all proxies of the name.
+#: How long opening a session waits to discover others (Zenoh's default). An application that has one address waits only
+#: for its proxy; one that has several must find all proxies with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
-#: Maximum size of a message to a proxy [bytes], as frames go the other way; a larger one is dropped before reassembly.
+#: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
 MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")
@@ -51,7 +51,7 @@ _OFF: Final = frozenset({"", "off", "0", "false", "no"})
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """An identity for mutual TLS, as PEM files."""
+    """An identity for mutual TLS, in PEM files."""
 
     ca: Path  #: certificate of the authority that signed all identities
     certificate: Path
@@ -60,34 +60,34 @@ class TlsFiles:
 
 @dataclass(frozen=True, slots=True)
 class FabricSettings:
-    """How to join the network; by default by multicast on the same network segments, without keys.
+    """How to join the network; by default by multicast on this host's network segments, without keys.
 
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
-    (port 7447). Without keys each stands for TCP (packets that must arrive) and UDP (commands and feedback), with keys
-    for QUIC. An address may also be a full Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used unchanged.
+    (port 7447). Each means both TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC
+    with keys. An address may also be a full Zenoh endpoint such as ``tcp/10.0.0.5:7447``, which is used unchanged.
 
     Raises:
-        UsageError: The identity is not valid or lacks its certificate and key, or the lease is out of range.
+        UsageError: The identity is invalid or has no certificate and key, or the lease is out of range.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     multicast: bool = True  #: discover by UDP multicast on this host's network segments
     tls: TlsFiles | None = None
-    #: Silence after which a link counts as lost [s]; peers learn the value, applications add 0.3 s. A mobile network
-    #: may be silent for seconds, and takes another to deliver lost packets.
+    #: Silence after which a link is considered lost [s]. Peers learn this value; applications add 0.3 s. A mobile
+    #: network may be silent for seconds, and need another second to deliver lost packets.
     lease_s: float = LEASE_S
     who: str = ANYONE  #: the identity: the certificate's common name
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
     access_control: dict[str, Any] | None = None
-    #: The keys behind ``tls`` and ``access_control``.
+    #: The keys that ``tls`` and ``access_control`` were made from.
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
-        """Return these settings with the newest roster in the key folder, for a new session.
+        """Return these settings with the newest roster in the key folder, for use by a new session.
 
         Raises:
-            LinkError: That roster revokes these keys themselves.
+            LinkError: That roster revokes the keys in use.
         """
         if self.ring is None:
             return self
@@ -101,18 +101,18 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """Return the silence that is tolerated beyond the default [s]."""
+        """How much longer than by default silence is tolerated [s]."""
         return self.lease_s - LEASE_S
 
     @property
     def reach(self) -> str:
-        """Where proxies are searched for, for people."""
+        """Where proxies are searched for, as text for users."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 
     @property
     def identity(self) -> Identity | None:
-        """The keys' identity; None without keys."""
+        """The identity of the keys; None without keys."""
         return None if self.ring is None else self.ring.credentials.identity
 
     def __post_init__(self) -> None:
@@ -124,9 +124,9 @@ class FabricSettings:
 
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
-    """Return these settings with keys: mutual TLS over QUIC, and access control by their roster."""
+    """Return these settings with keys: mutual TLS over QUIC, and access control based on their roster."""
     from skyloop.network.access import access_control
-    from skyloop.network.keys import KeyRing  # only with keys: these need cryptography
+    from skyloop.network.keys import KeyRing  # imported only if there are keys: needs cryptography
 
     return replace(
         settings,
@@ -137,23 +137,23 @@ def secured(settings: FabricSettings, credentials: Credentials) -> FabricSetting
     )
 
 
-#: ``True``: discover by multicast; addresses to connect to, separated by commas, with ``multicast`` among them to
-#: discover as well; ``False``: this host only; ``None``: the environment's choice.
+#: ``True``: discover by multicast; a string: addresses to connect to, separated by commas, plus ``multicast`` to
+#: discover as well; ``False``: this host only; ``None``: decided by the environment.
 NetworkChoice = bool | str | FabricSettings | None
 
 
 def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return the network settings; None to stay on this host.
+    """Return the network settings, or None to stay on this host.
 
-    A key that expires within a week is logged as a warning.
+    Log a warning if the key expires within a week.
 
     Args:
-        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves
-            this host.
-        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``. If that is not set, nothing
+            leaves this host.
+        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
 
     Raises:
-        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is not valid.
+        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is invalid.
     """
     found = _choose(network, keys)
     if found is not None and found.ring is not None:
@@ -185,17 +185,17 @@ def serving(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Return the settings of a proxy, a host or a router on the network.
+    """Return the network settings for a proxy, a host or a router.
 
     Args:
-        network: ``multicast``, or addresses of routers separated by commas, with ``multicast`` among them for both.
-        listen: Addresses to listen at.
-        connect: More addresses to connect to.
-        multicast: Whether multicast discovery works, where ``network`` names it.
-        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+        network: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
+        listen: Addresses to listen on.
+        connect: Further addresses to connect to.
+        multicast: Whether multicast discovery is used if ``network`` includes it.
+        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
 
     Raises:
-        UsageError: An address or the folder is not valid, or no address is given.
+        UsageError: An address or the folder is invalid, or no address is given.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -213,19 +213,19 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Make network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``.
+    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``.
 
     Raises:
-        UsageError: An address or the folder is not valid.
+        UsageError: An address or the folder is invalid.
     """
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
-    endpoints_of((*listen, *connect), found)  # report invalid addresses before opening anything
+    endpoints_of((*listen, *connect), found)  # reports invalid addresses before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
     return found if folder is None else secure(found, folder)
 
 
 def _lease_s() -> float:
-    """Return the lease in the environment [s]. Raises :class:`UsageError`."""
+    """Return the lease from the environment [s]. Raises :class:`UsageError`."""
     text = os.environ.get(LEASE_VARIABLE) or f"{LEASE_S:g}"
     try:
         return float(text)
@@ -234,55 +234,55 @@ def _lease_s() -> float:
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """Return these settings with the identity in a folder.
+    """Return these settings with the identity in the given folder.
 
     Raises:
-        UsageError: The folder is not valid, or an address can't be used with keys.
+        UsageError: The folder is invalid, or an address can't be used with keys.
     """
-    from skyloop.network.keys import load  # only with keys: it needs cryptography
+    from skyloop.network.keys import load  # imported only if there are keys: needs cryptography
 
     found = secured(plain, load(folder))
-    endpoints_of((*found.listen, *found.connect), found)  # keys allow fewer addresses
+    endpoints_of((*found.listen, *found.connect), found)  # fewer kinds of addresses are allowed with keys
     return found
 
 
 class Part(StrEnum):
     """A session's role in the network."""
 
-    PROXY = "proxy"  #: listens, applications connect to it
+    PROXY = "proxy"  #: listens for applications, which connect to it
     APP = "app"  #: connects to proxies
-    ROUTER = "router"  #: joins ends that can't reach one another
+    ROUTER = "router"  #: joins ends that can't reach one another directly
 
 
-#: Signs of life per lease: enough that some arrive on a path that loses three packets in ten.
+#: Signs of life per lease: enough for some to arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
-#: Messages queued for sending, by priority (Zenoh's maximum). With its default of 2, further ones are dropped within a
-#: millisecond: ten drones in one process report the same event at the same moment.
+#: Messages queued for sending, by priority (Zenoh's maximum). By default Zenoh queues 2, and drops further ones within
+#: a millisecond: ten drones in one process can report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Overrides a neighbour's requests: a slow reader blocks no other, neither here nor through a router. Answers are sent
-#: like their queries.
+#: Override what a neighbour requests: no reader is blocked by a slow one, neither here nor through a router. Answers
+#: are sent in the same way as their queries.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
     "messages": ["put", "delete", "query"],
     "flows": ["ingress", "egress"],
     "overwrite": {"congestion_control": "drop"},
 }
-#: Separates proxies from applications in Zenoh: a router forwards between regions, and assumes that the nodes of one
+#: Separates proxies from applications in Zenoh: a router forwards between regions, and assumes that the nodes within a
 #: region reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
 _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration by section; ``listen``: endpoints that replace the settings'.
+    """Return Zenoh's configuration by section; ``listen`` replaces the endpoints in the settings.
 
     Raises:
-        UsageError: An address is not valid.
+        UsageError: An address is invalid.
     """
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
-    # Cut off a neighbour that accepts none of Zenoh's own declarations for this long: one of Zenoh's few receiving
-    # threads waits for it meanwhile. All other messages are dropped when a link is congested.
+    # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long, because one of Zenoh's few
+    # receiving threads waits for it meanwhile. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
@@ -315,8 +315,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
     else:
         found["region_name"] = _REGIONS[part]
-        # Not a gateway for Zenoh's "clients", which are not admitted: all our nodes are peers. A gateway would forward
-        # each of the clients' declarations, and thousands of them would block it for seconds.
+        # Don't act as a gateway for Zenoh "clients", which are not admitted: all our nodes are peers. A gateway would
+        # forward each client's declarations, and thousands of them would block it for seconds.
         found["gateway"] = {"south": []}
     if settings.tls is not None:
         found["transport"]["link"]["tls"] = _tls(settings)
@@ -326,10 +326,10 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """Convert addresses (``HOST:PORT``, ``HOST`` or full endpoints) to Zenoh's: QUIC with keys, else TCP and UDP.
+    """Convert addresses (``HOST:PORT``, ``HOST`` or full endpoints) to Zenoh's: QUIC with keys, otherwise TCP and UDP.
 
     Raises:
-        UsageError: An address is not valid, or unencrypted although keys are used.
+        UsageError: An address is invalid, or unencrypted although keys are used.
     """
     found: list[str] = []
     for address in addresses:
@@ -354,9 +354,9 @@ def to_json(sections: dict[str, Any]) -> str:
 
 
 def listening(settings: FabricSettings) -> list[str]:
-    """Return the addresses to listen at, with a free port in place of port 0.
+    """Return the addresses to listen on, with a free port in place of port 0.
 
-    Without addresses in the settings, that is a free port on all interfaces.
+    If the settings have no addresses, listen on a free port on all interfaces.
 
     Raises:
         LinkError: No port is free.
@@ -371,10 +371,10 @@ def listening(settings: FabricSettings) -> list[str]:
 
 
 def free_port(host: str) -> int:
-    """Return a port that is now free for both TCP and UDP.
+    """Return a port that is currently free for both TCP and UDP.
 
     Raises:
-        LinkError: There is none, or this host does not have the address.
+        LinkError: No port is free, or this host does not have the address.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
@@ -393,10 +393,10 @@ def free_port(host: str) -> int:
 
 
 def _called(part: Part, has_addresses: bool) -> list[str]:
-    """Return the kinds of nodes to connect to on discovery.
+    """Return the kinds of nodes to connect to when they are discovered.
 
-    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node with given
-    addresses connects to no other router: a discovered one is not retried as often as an address.
+    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node that was given
+    addresses connects to no other routers, because a discovered router is not retried as often as an address.
     """
     if part is Part.APP:
         return ["router", "peer"]
@@ -404,7 +404,7 @@ def _called(part: Part, has_addresses: bool) -> list[str]:
 
 
 def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
-    """Return the accepted protocols; with keys, only encrypted ones."""
+    """Return the accepted protocols: only encrypted ones if there are keys."""
     usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
     return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
 
@@ -419,7 +419,7 @@ def _tls(settings: FabricSettings) -> dict[str, Any]:
         "connect_certificate": certificate,
         "connect_private_key": key,
         "enable_mtls": True,
-        # A certificate names an identity, which may be at any address.
+        # A certificate proves an identity, which may be at any address.
         "verify_name_on_connect": False,
         "close_link_on_expiration": True,
     }
@@ -429,7 +429,7 @@ def _with_port(address: str) -> str:
     """Return an address as HOST:PORT.
 
     Raises:
-        UsageError: It is not an address.
+        UsageError: The text is not an address.
     """
     host, colon, port = address.rpartition(":")
     if address.startswith("[") and address.endswith("]"):
@@ -447,5 +447,5 @@ def _host(address: str) -> str:
 
 
 def all_interfaces() -> str:
-    """Return the address of all interfaces of this host."""
+    """Return the address that stands for all interfaces of this host."""
     return "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"

@@ -1,7 +1,7 @@
-"""Applications' connections at the transport server, publishing to them, and the thread that sends to single ones.
+"""Applications' connections at the transport server, publishing to them, and a thread that sends to individual ones.
 
-Threads that answer an application only queue the answer here, and the sending thread never waits for an application.
-An application that acknowledges nothing costs a bounded amount of memory.
+Threads that answer an application only queue the answer here, and the sending thread never waits for an application. An
+application that acknowledges nothing uses a bounded amount of memory.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from skyloop.transport.priority import PacketBacklog
 if TYPE_CHECKING:
     import zenoh
 
-#: Limit of one application's packets, and of its commands, that wait for the handler. Further packets are not
-#: acknowledged, and so resent; further commands are dropped, as newer ones follow. Set-points count once.
+#: Maximum number of one application's packets, and of its commands, that wait for the handler. Further packets are not
+#: acknowledged and are therefore resent; further commands are dropped, since newer ones follow. Set-points count once.
 MAX_WAITING: Final = 64
-POLL_S: Final = 0.05  #: how often to check for packets to resend
-_OWN_AT_MOST: Final = 8  # the transport's own queued packets; they may be lost, and are requested again
+POLL_S: Final = 0.05  #: interval between checks for packets to resend
+_OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are requested again
 _log = logging.getLogger(__name__)
 _VIDEO: Final = video("")
 _STREAMS: Final = stream("")
@@ -38,7 +38,7 @@ _RESULTS: Final = results("")
 
 
 class ServerConnection:
-    """An application at the transport server. Its lock guards its outgoing packets and its topics."""
+    """An application connected to the transport server. Its lock guards its outgoing packets and its topics."""
 
     __slots__ = (
         "_own",
@@ -66,40 +66,40 @@ class ServerConnection:
         self.who = who
         self.id = connection
         self.admission = admission
-        self.joined_s = joined_s  #: when it asked to join
-        self.commands = PacketBacklog(MAX_WAITING)  #: waiting for the handler; the server guards it
-        self.announced = False  #: the handler knows it
-        self.confirmed = False  #: its token was seen, so that Zenoh will report its end
-        self.ended = False  #: further packets from it are ignored
-        self.reason = ""  #: why it ends, once one end has given a reason
+        self.joined_s = joined_s  #: when the application asked to join
+        self.commands = PacketBacklog(MAX_WAITING)  #: commands waiting for the handler; guarded by the server
+        self.announced = False  #: the handler knows the application
+        self.confirmed = False  #: its token has been seen, so Zenoh will report its end
+        self.ended = False  #: further packets from the application are ignored
+        self.reason = ""  #: why the connection ends, once either end has given a reason
         self.lock = threading.Lock()
-        self.outgoing = Outgoing()  #: packets to it
-        self.receiver = Receiver()  #: packets from it
-        self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to it
-        self._taken = 0  # acknowledge its packets up to this number; 0: nothing to acknowledge
-        self.topics: dict[str, int] = {}  #: each with the number up to which it has acknowledged
-        self.paces: dict[str, Pace] = {}  #: of topics whose newest packet alone counts
-        self.left = False  #: it has unsubscribed from everything for good
+        self.outgoing = Outgoing()  #: packets to the application
+        self.receiver = Receiver()  #: packets from the application
+        self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to the application
+        self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
+        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number up to which it is acknowledged
+        self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet counts
+        self.left = False  #: the application has unsubscribed from everything for good
 
     def may_command(self, drone: str) -> bool:
-        """Return whether its proven identity gives it the right to send this drone more than questions."""
+        """Return whether its proven identity permits more than queries to this drone."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's packet has no room: more than :data:`DEPTH` earlier ones are unacknowledged."""
+        """Return whether a topic's next packet has no room, because more than :data:`DEPTH` are unacknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet it has acknowledged a topic.
+        """Record up to which packet a topic has been acknowledged.
 
         Args:
-            topic: The topic; empty for packets to this application only.
+            topic: The topic; empty for packets sent to this application only.
             number: The last acknowledged packet.
             now_s: The monotonic clock [s].
 
         Returns:
-            Whether further packets to this application only may be due.
+            Whether further packets sent to this application only may be due.
         """
         with self.lock:
             if not topic:
@@ -112,24 +112,24 @@ class ServerConnection:
             return False
 
     def queue(self, packet: bytes) -> str:
-        """Keep a packet until it is acknowledged; return why there is no room for it, empty if there is."""
+        """Keep a packet until it is acknowledged; return why there is no room for it, or an empty string."""
         with self.lock:
             if self.outgoing.put(packet):
                 return ""
         return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, are unacknowledged"
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long it has acknowledged nothing [s]; 0 if all packets are acknowledged."""
+        """Return for how long nothing has been acknowledged [s]; 0 if no packet is unacknowledged."""
         with self.lock:
             return self.outgoing.stalled_s(now_s)
 
     def queue_own(self, packet: bytes) -> None:
-        """Queue one of the transport's own packets, which is sent once and may be lost."""
+        """Queue one of the transport's own packets, which is sent only once and may be lost."""
         with self.lock:
             self._own.append(packet)
 
     def acknowledge(self, number: int) -> None:
-        """Acknowledge its packets up to this number."""
+        """Acknowledge the application's packets up to this number."""
         with self.lock:
             self._taken = max(self._taken, number)
 
@@ -137,34 +137,34 @@ class ServerConnection:
         """Return the packets to send now.
 
         Returns:
-            The packets with their numbers (0: the transport's own), and whether more may become due with time.
+            The packets with their numbers (0: the transport's own), and whether more may become due later.
         """
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
                 found.insert(0, (0, packets.taken("", self._taken)))
                 self._taken = 0
-            found += [(0, packet) for packet in self._own]  # a bye comes last
+            found += [(0, packet) for packet in self._own]  # a bye is sent last
             self._own.clear()
             return found, self.outgoing.under_way and not self.ended
 
 
-#: Sends a packet to an application; its number is 0 for one that may be lost.
+#: Sends a packet to an application, with number 0 if it may be lost.
 Put = Callable[[ServerConnection, bytes, int], object]
 
 
 class Sender:
-    """Sends the connections' packets, and resends unacknowledged ones. Any thread may call :meth:`wake`.
+    """Sends the connections' packets and resends unacknowledged ones. :meth:`wake` may be called on any thread.
 
     Args:
-        put: Sends one packet; called on this object's thread.
-        name: The proxy's name, for the thread's name.
+        put: Sends one packet; called on the sender's thread.
+        name: The proxy's name, used in the thread's name.
     """
 
     def __init__(self, put: Put, name: str) -> None:
         self._put = put
         self._changed = threading.Condition(threading.Lock())
-        self._ready: dict[ServerConnection, None] = {}  # in the order of arrival
+        self._ready: dict[ServerConnection, None] = {}  # in order of arrival
         self._waiting: set[ServerConnection] = set()  # with unacknowledged packets; used only by this thread
         self._ended = False
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
@@ -174,13 +174,13 @@ class Sender:
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Have a connection's due packets sent."""
+        """Schedule the sending of a connection's due packets."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()
 
     def end(self) -> None:
-        """Send what can be sent at once, and end the thread. Not on that thread."""
+        """Send what can be sent immediately, and end the thread. Must not be called on that thread."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -213,24 +213,24 @@ class Sender:
 
 
 class Publisher:
-    """The subscriptions of all connections, and publishing to them. Thread-safe."""
+    """Keeps the subscriptions of all connections and publishes to them. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
         self._run = bytes.fromhex(run)
         self._sealer = sealer
         self._clock = clock
-        self.held_back = 0  #: packets skipped because all subscribers were silent
-        self._lock = threading.RLock()  # guards what follows
-        self._session: Session | None = None  # while it may publish
+        self.held_back = 0  #: number of packets skipped because all subscribers were silent
+        self._lock = threading.RLock()  # guards the following attributes
+        self._session: Session | None = None  # set while publishing is possible
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._numbers: dict[str, int] = {}  # of each topic's last packet
+        self._numbers: dict[str, int] = {}  # number of the last packet of each topic
         self._topic_problem: Callable[[str], str] = lambda _: ""
         self.video = FramePublisher(self._send_frame, name)
 
     def open(self, session: Session, topic_problem: Callable[[str], str]) -> None:
-        """Start publishing; ``topic_problem`` returns why a topic can't be subscribed to, empty if it can."""
+        """Start publishing. ``topic_problem`` returns why a topic can't be subscribed to; empty if it can."""
         with self._lock:
             self._session = session
             self._topic_problem = self.video.topic_problem = topic_problem
@@ -238,16 +238,16 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing.
 
-        Publishers are not undeclared: one in use by another thread would refuse that; it ends with its last user.
+        Publishers are not undeclared, which would fail while another thread uses one; each ends with its last user.
         """
         with self._lock:
             self._session = None
             self._publishers.clear()
 
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to all subscribers of a topic; return how many of them lag too far behind to receive it.
+        """Send a packet to all subscribers of a topic; return how many are too far behind to receive it.
 
-        On a topic whose newest packet alone counts, most packets are skipped while the paths to all subscribers are
+        On a topic where only the newest packet counts, most packets are skipped while the paths to all subscribers are
         stalled.
         """
         with self._lock:
@@ -272,7 +272,7 @@ class Publisher:
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
-            else:  # an application chose this topic: leave no declaration behind
+            else:  # the topic was named by an application: leave no declaration behind
                 session.zenoh.put(
                     key,
                     payload,
@@ -286,17 +286,17 @@ class Publisher:
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that miss it."""
+        """Publish a frame; return the number of readers that will miss it."""
         return self.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, of its frames in all forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))
 
     def subscribe(self, connection: ServerConnection, request: packets.Subscribe) -> bool:
-        """Subscribe a connection to a topic, or unsubscribe it; return False if that fails (see :meth:`problem`)."""
+        """Subscribe a connection to a topic, or unsubscribe it. Return False if that fails (see :meth:`problem`)."""
         topic = request.topic
         with self._lock, connection.lock:
             if connection.ended or connection.left or request.on == (topic in connection.topics):
@@ -318,14 +318,14 @@ class Publisher:
             return True
 
     def problem(self, connection: ServerConnection, topic: str) -> str:
-        """Return why a connection could not subscribe to a topic."""
+        """Return why a connection can't subscribe to a topic."""
         problem = self._topic_problem(topic)
         if not problem and topic.startswith(_VIDEO):
             problem = self.video.problem(connection.id, topic)
         return problem or too_many_topics(topic)
 
     def leave(self, connection: ServerConnection) -> None:
-        """Unsubscribe a connection that has ended from everything."""
+        """Unsubscribe a connection that has ended from all topics."""
         with self._lock, connection.lock:
             connection.left = True
             for topic in list(connection.topics):
@@ -342,12 +342,12 @@ class Publisher:
             self._subscribed.pop(topic, None)
             if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # ends with its last user
+                self._publishers.pop(topic, None)  # it ends with its last user
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         z = load()
         newest_wins = layout.newest_wins(topic)
-        usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # as for frames
+        usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # the same as for frames
         return session.zenoh.declare_publisher(
             layout.topic(self._name, topic),
             congestion_control=z.CongestionControl.DROP,
@@ -359,7 +359,7 @@ class Publisher:
     def _send_frame(
         self, variant: Variant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
-        """Send an encoded frame. On the camera's thread."""
+        """Send an encoded frame. Called on the camera's thread."""
         z, session, request = load(), self._session, variant.request
         if session is None:
             return

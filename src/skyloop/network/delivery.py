@@ -1,10 +1,10 @@
-"""Numbered packets that arrive exactly once and in order, despite losses on the way.
+"""Deliver numbered packets exactly once and in order, even if some are lost on the way.
 
-The number of packets in flight is bounded. Time is an argument, and nothing here sends.
+The number of packets in flight is bounded. Time is passed as an argument, and the callers do the sending.
 
-Sending must never block, so Zenoh drops what a congested path can't carry, here or at a router; it also drops packets
-that reach a node before the subscription does. Hence each numbered packet is kept and resent until the other end
-acknowledges it, and few are in flight at once, so that they do not congest a slow path.
+Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router; it also drops
+packets that reach a node before the subscription does. Each numbered packet is therefore kept and resent until the
+other end acknowledges it. Only a few are in flight at once, to avoid congesting a slow path.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Final
 
 from skyloop.network import packets
 
-DEPTH: Final = 256  #: unacknowledged packets to one end before further ones are refused
-MAX_BYTES: Final = 1 << 20  #: the same in bytes
-RECENT_PACKETS: Final = 64  #: an end's latest packets, among which repeats are recognised
-ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this many packets
-#: Packets in flight at once: as many as Zenoh queues per link before it drops one (config._QUEUES).
+DEPTH: Final = 256  #: number of unacknowledged packets to one end before further ones are refused
+MAX_BYTES: Final = 1 << 20  #: size of unacknowledged packets to one end before further ones are refused [bytes]
+RECENT_PACKETS: Final = 64  #: number of latest packets remembered to detect repeats
+ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets …
+#: Number of packets in flight: as many as Zenoh queues per link before it drops one (config._QUEUES).
 ON_THE_WAY: Final = 16
-ON_THE_WAY_BYTES: Final = 1 << 18  #: the same in bytes
-ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and this often on topics where only the newest counts (:class:`Pace`)
-STANDS_S: Final = 0.5  #: a path with a packet unacknowledged for this long is stalled …
-SLOW_S: Final = 0.25  #: … and until it recovers, a packet is sent this often
+ON_THE_WAY_BYTES: Final = 1 << 18  #: total size of packets in flight [bytes]
+ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and at this interval where only the newest packet counts (:class:`Pace`)
+STANDS_S: Final = 0.5  #: a path is stalled if a packet is unacknowledged for this long …
+SLOW_S: Final = 0.25  #: … and until it recovers, one packet is sent per this interval
 AGAIN_S: Final = 0.2  #: resend after this long without an answer, then after twice as long, …
-AGAIN_AT_MOST_S: Final = 0.5  #: … up to this
+AGAIN_AT_MOST_S: Final = 0.5  #: … up to this limit
 
 
 @dataclass(slots=True)
@@ -37,32 +37,30 @@ class _Packet:
     number: int
     data: bytes
     way: str
-    sent_s: float = 0.0  #: last sent; 0: not yet
+    sent_s: float = 0.0  #: when it was last sent; 0: not yet
 
 
 class Outgoing:
-    """The unacknowledged packets for one end. Not thread-safe."""
+    """The unacknowledged packets to one end. Not thread-safe."""
 
     def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
         self._depth = depth
         self._most = most_bytes
-        self._kept: deque[_Packet] = deque()  # those in flight first, then the waiting ones
+        self._kept: deque[_Packet] = deque()  # packets in flight, followed by waiting ones
         self._bytes = 0
-        self._under_way = 0  # packets in flight
+        self._under_way = 0  # number of packets in flight
         self._under_way_bytes = 0
         self._next = 1
         self._again_s = AGAIN_S
-        self._headway_s = (
-            0.0  # when the other end last acknowledged something, or when an idle path got its first packet
-        )
+        self._headway_s = 0.0  # when the other end last acknowledged a packet, or when an idle path got its first one
 
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
-        """Keep one more packet.
+        """Keep another packet until it is acknowledged.
 
         Args:
             packet: The packet.
-            way: The key to send it by, for the sender.
-            own: One of the transport's own small packets, for which extra room is reserved.
+            way: The key that the sender sends it by.
+            own: Whether it is one of the transport's own small packets, for which extra room is reserved.
 
         Returns:
             False if there is no room for it.
@@ -79,7 +77,7 @@ class Outgoing:
         return True
 
     def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
-        """Return number, packet and way of the packets to send: new ones if there is room, and apparently lost ones."""
+        """Return number, packet and way of each packet to send: new ones if there is room, and any that seem lost."""
         found: list[tuple[int, bytes, str]] = []
         if self._under_way and now_s - self._kept[0].sent_s >= self._again_s:
             self._again_s = min(2 * self._again_s, AGAIN_AT_MOST_S)
@@ -100,9 +98,9 @@ class Outgoing:
         return found
 
     def taken(self, number: int, now_s: float) -> None:
-        """Drop the packets up to this number, which the other end has acknowledged.
+        """Remove the packets up to this number, which the other end has acknowledged.
 
-        The number of a packet not yet sent is ignored.
+        A number that has not been sent yet is ignored.
         """
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
@@ -116,23 +114,23 @@ class Outgoing:
 
     @property
     def under_way(self) -> bool:
-        """Whether any sent packet is unacknowledged."""
+        """Whether any packet was sent but not acknowledged."""
         return self._under_way > 0
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long the other end has acknowledged nothing [s]; 0 if nothing is in flight."""
+        """Return for how long the other end has acknowledged nothing [s]; 0 if no packet is in flight."""
         return now_s - self._headway_s if self._under_way else 0.0
 
 
 class Incoming:
-    """Puts the numbered packets of the other end's :class:`Outgoing` in order. Not thread-safe."""
+    """Reorders the numbered packets from the other end's :class:`Outgoing`. Not thread-safe."""
 
     def __init__(self) -> None:
-        self.taken = 0  #: number up to which all packets arrived, to acknowledge
+        self.taken = 0  #: number up to which all packets have arrived, to be acknowledged
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
-        """Return the packets that can be delivered after this one arrived, in order; none for a repeat."""
+        """Return the packets that can be delivered now that this one arrived, in order; none if it is a repeat."""
         if number != self.taken + 1:
             if self.taken < number <= self.taken + ON_THE_WAY:
                 self._early.setdefault(number, packet)
@@ -146,10 +144,10 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when a subscriber acknowledges the packets of a topic. Not thread-safe.
+    """Decides when a subscriber acknowledges a topic's packets. Not thread-safe.
 
     Args:
-        every_s: Acknowledge the first packet after this time, too [s].
+        every_s: Also acknowledge the first packet after this time [s].
     """
 
     def __init__(self, every_s: float = math.inf) -> None:
@@ -171,18 +169,18 @@ class AckPolicy:
 
 
 class Pace:
-    """Whether the path to one subscriber carries a topic's packets. One thread sends, another acknowledges.
+    """Tracks whether the path to one subscriber carries a topic's packets. One thread sends, another acknowledges.
 
     A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams, which then delay all
-    later packets. So a silent subscriber is sent few.
+    later packets. Few packets are therefore sent to a silent subscriber.
     """
 
     __slots__ = ("_acknowledged", "_eager", "_newest", "_sent_s", "_since_s")
 
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
-        self._eager = False  # it acknowledges more often than it must, so that silence is significant
-        self._sent_s = -math.inf  # when the newest was sent
+        self._eager = False  # it acknowledges more often than required, so its silence is significant
+        self._sent_s = -math.inf  # when the newest packet was sent
         self._since_s = math.inf  # when the oldest unacknowledged packet was sent, or later
 
     def may_send(self, now_s: float) -> bool:
@@ -191,12 +189,12 @@ class Pace:
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Record a sent packet."""
+        """Record that a packet was sent."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 
     def taken(self, number: int, now_s: float) -> None:
-        """Record an acknowledgement up to this number; ignore a number that was not sent yet."""
+        """Record an acknowledgement up to this number; ignore a number that has not been sent yet."""
         if not self._acknowledged < number <= self._newest:
             return
         self._eager = self._eager or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
@@ -205,7 +203,7 @@ class Pace:
 
 
 class RecentPackets:
-    """The latest packets: with a direct path and one through a router, each arrives twice."""
+    """Remembers the latest packets: if there is a direct path and one through a router, each packet arrives twice."""
 
     def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
@@ -219,10 +217,10 @@ class RecentPackets:
 
 
 class Receiver:
-    """Receives packets at one end of a connection: numbered ones exactly once and in order, the others at most once.
+    """Receives packets at one end of a connection: numbered ones exactly once and in order, all others at most once.
 
-    The transport's own packets go to ``control``, which returns whether it handled them; unhandled and all other
-    packets go to ``deliver``. Thread-safe: for numbered packets, one thread at a time calls both.
+    The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
+    other packets are passed to ``deliver``. Thread-safe: for numbered packets, only one thread at a time calls either.
     """
 
     def __init__(self) -> None:
@@ -239,17 +237,17 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet that is resent until it is acknowledged.
+        """Receive a packet that the other end resends until it is acknowledged.
 
         Args:
             number: The packet's number, from 1.
             packet: The packet.
-            has_room: Whether another packet fits; if not, this one is ignored and will be resent.
+            has_room: Whether there is room for another packet; if not, this one is ignored and will be resent.
             control: Handles the transport's own packets.
             deliver: Handles all others.
 
         Returns:
-            The number up to which all packets were accepted, to acknowledge.
+            The number up to which all packets were accepted, to be acknowledged.
         """
         with self._lock:
             if has_room():

@@ -1,8 +1,8 @@
-"""Discovery: listing the network's proxies, finding one that comes back, and joining one.
+"""Discovery: list the network's proxies, find one that comes back, and join one.
 
-Zenoh retries given addresses, but searches by multicast only after 1, 2, 4 and then every 8 seconds. An application
-that misses a proxy therefore searches here, without a connection, and opens a new session when a node answers that the
-present session does not know: that finds the node within milliseconds.
+Zenoh retries the addresses it was given, but searches by multicast only after 1, 2, 4 and then every 8 seconds. An
+application that misses a proxy therefore searches here, without a connection. If a node answers that the current
+session does not know, the application opens a new session, which finds that node within milliseconds.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 
     import zenoh
 
-#: Time after opening for a session to find the nodes within reach: by multicast, or at the given addresses.
+#: Time for a newly opened session to find all nodes within reach, either by multicast or at the given addresses.
 SETTLE_S: Final = 0.6
-ANSWER_S: Final = 0.5  #: time for proxies to describe themselves
-#: Time for a linked node to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
+ANSWER_S: Final = 0.5  #: time for proxies to send their descriptions
+#: Time for a linked node to list the tokens that it knows: normally milliseconds, unless it is flooded with tokens.
 SYNC_S: Final = 5.0
-RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three in a split network
+RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three if the network was split
 SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
-YOUNG_S: Final = 1.0  #: age up to which a new session searches well without help
-FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long
+YOUNG_S: Final = 1.0  #: up to this age, a session searches well without help
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not tried again for this long
 _POLL_S: Final = 0.05
-JOIN_S: Final = 1.0  #: time for a proxy to admit this application
+JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
-MAX_CANDIDATES: Final = 4  #: with keys: proxies of one name to ask until one proves that it is the right one
+MAX_CANDIDATES: Final = 4  #: with keys: number of proxies with one name that are asked until one proves its identity
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
@@ -52,28 +52,28 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
         settings: How to join the network.
 
     Returns:
-        The proxies by name; those of one name by age, oldest first.
+        The proxies, sorted by name and, for equal names, by age, oldest first.
 
     Raises:
-        LinkError: The network can't be joined.
+        LinkError: Joining the network failed.
     """
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
-        runs(session)  # once that is answered, all reachable nodes are known
+        runs(session)  # once this is answered, all reachable nodes are known
         return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
     finally:
         release(session)
 
 
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, oldest first; several only if a network was split.
+    """Return the proxies with this name, oldest first. There are several only if a network was split.
 
     Raises:
-        LinkError: The network can't be joined.
+        LinkError: Joining the network failed.
     """
     if not settings.multicast and not settings.connect:
-        return []  # others would have to connect to us, and we don't listen yet
+        return []  # others would have to connect to us, but we don't listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
     try:
         _settle(session)
@@ -84,14 +84,14 @@ def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
 
 
 def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, oldest first, on an open session."""
+    """Return the proxies with this name, oldest first, using an open session."""
     return sorted(_ask(session, name), key=lambda about: about.since_ns)
 
 
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
-    """Return NAME and RUN of the transport servers whose tokens are visible now.
+    """Return NAME and RUN of the transport servers whose tokens are currently visible.
 
-    Takes as long as the linked nodes need to send their tokens, up to :data:`SYNC_S`.
+    This takes as long as the linked nodes need to send their tokens, but at most :data:`SYNC_S`.
     """
     return listed(session, name)[0]
 
@@ -134,7 +134,7 @@ def _ask(session: Session, name: str) -> list[ProxyInfo]:
 
 
 def _oldest_of_each(found: list[ProxyInfo]) -> list[ProxyInfo]:
-    """Return the oldest proxies of each name, so that many answers for one name hide no other."""
+    """Return the oldest proxies of each name, so that many answers for one name can't hide other names."""
     counts: Counter[str] = Counter()
     few = []
     for about in sorted(found, key=lambda about: about.since_ns):
@@ -145,20 +145,20 @@ def _oldest_of_each(found: list[ProxyInfo]) -> list[ProxyInfo]:
 
 
 class UnreachablePeers:
-    """Peers that answered a search but could not be reached, such as another lab's with other keys."""
+    """Peers that answered a search but could not be reached, for example those of a lab with other keys."""
 
     def __init__(self) -> None:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether an unknown peer answered for which no session was opened yet."""
+        """Return whether an answer came from an unknown peer for which no session has been opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)
         return bool(new)
 
     def clear(self) -> None:
-        """Forget the peers: a proxy was reached, so earlier attempts say nothing about the next one."""
+        """Forget the peers: after a proxy was reached, earlier failures say nothing about the next attempt."""
         self._tried.clear()
 
 
@@ -167,13 +167,13 @@ _lock: Final = threading.Lock()
 
 
 def proxy_reached() -> None:
-    """Forget unreachable peers after reaching a proxy."""
+    """Forget unreachable peers, because a proxy was reached."""
     with _lock:
         _UNREACHABLE.clear()
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know; if there are any, retire it and return True."""
+    """Search for nodes that a session does not know. If there are any, retire the session and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -186,7 +186,7 @@ def renew(session: Session) -> bool:
 
 
 def _search(session: Session) -> set[str]:
-    """Return the identities of the nodes that answer now and can be connected to."""
+    """Return the identities of the nodes that answer now and accept connections."""
     answered: set[str] = set()
 
     def hello(answer: Any) -> None:
@@ -203,13 +203,13 @@ def _search(session: Session) -> set[str]:
 
 
 class ProxyWatch:
-    """Watches which transport servers of one name are alive.
+    """Monitors which transport servers with one name are alive.
 
     Args:
         session: The Zenoh session.
         name: The proxy's name.
         on_gone: Called with the run of a transport server that disappears, on one of Zenoh's threads.
-        known: An earlier report of a proxy of this name about itself: it is not asked again.
+        known: The description of a proxy with this name, if received earlier; it is not requested again.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class ProxyWatch:
         self._changed = threading.Condition()
 
     def declare(self) -> Any:
-        """Start watching; the caller undeclares the result."""
+        """Start watching. The caller must undeclare the result."""
         return self._session.zenoh.liveliness().declare_subscriber(
             layout.alive(self._name, "*"), self._session.callback(self._on_token), history=True
         )
@@ -236,17 +236,17 @@ class ProxyWatch:
         """Wait for a proxy with this name, then up to ``list_s`` [s] for linked nodes to list theirs.
 
         Returns:
-            Each candidate's run and its report about itself, best first. The best is the oldest; with keys the others
-            follow, as the oldest may have no key for this name.
+            Each candidate's run and description, best first. The best is the oldest; with keys the others follow,
+            because the oldest may have no key for this name.
 
         Raises:
-            UnknownNameError: None can be reached.
-            NoAnswerError: One was found but has disappeared, or a linked node does not list its tokens.
+            UnknownNameError: No proxy with this name can be reached.
+            NoAnswerError: A proxy was found but has disappeared, or a linked node does not list its tokens.
         """
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
         if not found:
-            # A node flooded with tokens may list many others before the proxy's: this waits for all of them.
+            # A node flooded with tokens may list many others before the proxy's token, so wait for all of them.
             known, complete = listed(self._session, within_s=list_s)
             with self._changed:
                 self._runs.update(run for other, run in known if other == self._name)
@@ -275,7 +275,7 @@ class ProxyWatch:
         return found[: 1 if self._session.settings.ring is None else MAX_CANDIDATES]
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        """Record that a proxy with this name appeared or disappeared."""
+        """Record that a proxy with this name has appeared or disappeared."""
         try:
             _, run = layout.parse_alive(str(sample.key_expr))
         except DecodeError:
@@ -289,7 +289,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask one run of a proxy to admit a connection, and return its terms.
+    """Ask one run of a proxy to admit a connection; return its terms.
 
     Raises:
         LinkError: The proxy refuses or does not answer (:class:`NoAnswerError`), or an impostor answers.
@@ -311,7 +311,7 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
     for reply in replies:
         if reply.err is not None:
             words = reply.err.payload.to_string()[:400]
-            if words == TIMED_OUT:  # sent by a router after a time-out, so not a refusal
+            if words == TIMED_OUT:  # sent by a router after a time-out, so it is not a refusal
                 continue
             raise LinkError(f"the proxy {name!r} does not admit us: {words}")
         try:

@@ -1,7 +1,7 @@
-"""The server's video: each subscribed variant of a frame is encoded once, and sent no faster than readers receive it.
+"""Send the server's video. Each subscribed variant of a frame is encoded once and sent no faster than readers take it.
 
-A reader has up to :data:`WINDOW` frames in flight. Until it acknowledges one, it misses further frames, and then gets
-the newest: a slow link shows fewer frames, never old ones.
+Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until it acknowledges one; then it
+gets the newest. A slow link thus shows fewer frames, but never old ones.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from skyloop.messages.subscription import FrameFilter, VideoRequest
 from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
-WINDOW: Final = 2  #: frames in flight to one reader
-#: Forms of one camera's frames. Each costs its own encoding; the n parts of one together cost no more than one. The
-#: default forms are not counted, which leaves room for a pilot, whatever others request.
+WINDOW: Final = 2  #: number of frames in flight to one reader
+#: Forms of one camera's frames. Each is encoded separately; the n parts of one form together cost no more than one. The
+#: default forms are not counted, which leaves room for a pilot whatever others request.
 MAX_FORMS: Final = 32
-MAX_FORMS_EACH: Final = 8  #: forms that one connection may read
-#: A frame unacknowledged for this long counts as lost: Zenoh drops what a congested link can't carry.
+MAX_FORMS_EACH: Final = 8  #: number of forms that one connection may read
+#: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
-#: Sends one encoded frame of a variant: to all its readers, or to these connections.
+#: Sends one encoded frame of a variant, either to all its readers or to the given connections.
 Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
 
 
@@ -40,7 +40,7 @@ Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | Non
 class PublishedFrame:
     """A published frame."""
 
-    number: int  #: from 1, over all cameras
+    number: int  #: number of the frame, counted from 1 over all cameras
     header: FrameHeader
     pixels: Pixels
 
@@ -51,12 +51,12 @@ class Reader:
     __slots__ = ("_on_way", "due", "waits")
 
     def __init__(self) -> None:
-        self._on_way: deque[tuple[int, int]] = deque()  # number and time
-        self.due = False  #: send it the newest frame
+        self._on_way: deque[tuple[int, int]] = deque()  # number and time sent
+        self.due = False  #: the newest frame should be sent to it
         self.waits = False  #: it has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
-        """Return whether another frame may be sent; frames older than :data:`LOST_NS` count as lost."""
+        """Return whether another frame may be sent. Frames sent longer than :data:`LOST_NS` ago are considered lost."""
         while self._on_way and now_ns - self._on_way[0][1] > LOST_NS:
             self._on_way.popleft()
         return len(self._on_way) < WINDOW
@@ -67,7 +67,7 @@ class Reader:
         self.due, self.waits = True, False
 
     def sent(self, number: int, now_ns: int) -> None:
-        """Record that the due frame was sent, or a newer one in its place."""
+        """Record that the due frame, or a newer one in its place, was sent."""
         if self._on_way:
             self._on_way[-1] = (number, now_ns)
         self.due = self.waits = False
@@ -79,7 +79,7 @@ class Reader:
 
 
 class Variant:
-    """One form of one camera's frames, and its readers."""
+    """One form of a camera's frames, and its readers."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
@@ -89,7 +89,7 @@ class Variant:
 
 
 class FramePublisher:
-    """All cameras of a transport server. Thread-safe; copies, encodes and sends outside its lock."""
+    """Publishes the frames of all of a server's cameras. Thread-safe; copies, encodes and sends outside its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
         #: Returns why a topic can't be subscribed to; empty if it can.
@@ -102,13 +102,13 @@ class FramePublisher:
         self._threads: dict[str, threading.Thread] = {}
         self._number = 0
         self._ended = False
-        self._unable: set[str] = set()  # topics whose encoding failed and was logged
+        self._unable: set[str] = set()  # topics whose encoding failed and has been logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame, copying its pixels if the camera has readers; its thread encodes and sends it.
+        """Publish a frame. If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
 
         Returns:
-            The number of readers that miss it, with :data:`WINDOW` frames in flight.
+            The number of readers that miss it because :data:`WINDOW` frames are in flight to them.
         """
         variants = self._variants.get(header.camera)
         if not variants:
@@ -117,7 +117,7 @@ class FramePublisher:
             wanted = [v for v in variants.values() if v.readers and v.filter.wants(header.seq, header.captured_ns)]
         if not wanted:
             return 0
-        copy = pixels.reshape(-1).copy()  # releases the interpreter lock, unlike tobytes()
+        copy = pixels.reshape(-1).copy()  # unlike tobytes(), this releases the GIL
         now_ns = self._clock()
         missed = due = 0
         with self._changed:
@@ -137,12 +137,12 @@ class FramePublisher:
         return missed
 
     def readers(self, camera: str) -> int:
-        """Return the number of a camera's subscriptions, in all forms."""
+        """Return the number of subscriptions to a camera, in all forms."""
         with self._changed:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send a connection frames from the next one on; return False if that fails (see :meth:`problem`)."""
+        """Send frames to a connection, starting with the next one. Return False if that fails (see :meth:`problem`)."""
         with self._changed:
             if self._problem(key, topic):
                 return False
@@ -155,7 +155,7 @@ class FramePublisher:
                 )
                 try:
                     thread.start()
-                except RuntimeError:  # no more threads
+                except RuntimeError:  # no more threads can be started
                     self._drop(request.camera, topic, key)
                     return False
                 self._threads[request.camera] = thread
@@ -189,7 +189,7 @@ class FramePublisher:
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:
-        """Stop sending a connection the frames of a topic."""
+        """Stop sending a topic's frames to a connection."""
         with self._changed, contextlib.suppress(UsageError):
             camera = VideoRequest.parse(topic).camera
             self._drop(camera, topic, key)
@@ -202,7 +202,7 @@ class FramePublisher:
                     self._drop(camera, topic, key)
 
     def taken(self, key: Hashable, topic: str, number: int) -> None:
-        """Record up to which frame a connection has received a topic; send it the newest if it has missed one."""
+        """Record up to which frame a connection has received a topic. If it has missed one, send it the newest."""
         with self._changed:
             for variants in self._variants.values():
                 variant = variants.get(topic)
@@ -230,7 +230,7 @@ class FramePublisher:
         if variant is not None and variant.readers.pop(key, None) is not None and not variant.readers:
             del variants[topic]
             self._unable.discard(topic)
-            if not variants:  # the camera's last reader has left: its thread ends
+            if not variants:  # the camera's last reader has left, so its thread ends
                 del self._variants[camera]
                 self._changed.notify_all()
 
@@ -246,10 +246,10 @@ class FramePublisher:
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
-        """Wait for a variant with readers that are due.
+        """Wait for a variant that has readers due for a frame.
 
         Returns:
-            The variant, its newest frame and those readers (None: all); None at the end, or when the camera has no
+            The variant, its newest frame and those readers (None: all). None at the end, or if the camera has no
             readers.
         """
         with self._changed:
@@ -263,14 +263,14 @@ class FramePublisher:
                     now_ns = self._clock()
                     for key in due:
                         variant.readers[key].sent(picture.number, now_ns)
-                    variants[topic] = variants.pop(topic)  # the others come first next time
+                    variants[topic] = variants.pop(topic)  # next time, the others come first
                     return variant, picture, None if len(due) == len(variant.readers) else due
                 self._changed.wait()
             self._threads.pop(camera, None)
         return None
 
     def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
-        """Encode a frame as requested; if that fails, return it unencoded and log that once."""
+        """Encode a frame as requested; if that fails, return it unencoded and log the failure once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)
         except (MissingExtraError, LinkError) as error:
@@ -282,7 +282,7 @@ class FramePublisher:
 
 
 def _cost(request: VideoRequest) -> float:
-    """Return the share of the frames that must be encoded for a form."""
+    """Return the fraction of frames that must be encoded for a form."""
     return 1.0 if request.part is None else 1.0 / request.part[1]
 
 

@@ -1,6 +1,6 @@
-"""The queue of the one thread that calls a handler: commands first, connections in turns.
+"""The queue for the thread that calls a handler: commands come first, and connections take turns.
 
-Hence two hundred requests of one connection delay the others no longer than one does.
+Two hundred requests from one connection therefore delay the others no more than one request would.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Hashable
 from typing import Final, Generic, TypeVar
 
 Item = TypeVar("Item")
-#: After this many commands in a row, handle one other packet: endless commands must not stop others from requesting
-#: authority.
+#: After this number of consecutive commands, handle one other packet, so that endless commands can't stop others from
+#: requesting authority.
 IN_A_ROW: Final = 16
 
 
 class _TurnQueue(Generic[Item]):
-    """Queues of the connections, which take turns."""
+    """One queue per connection; the connections take turns."""
 
     def __init__(self) -> None:
         self._order: deque[Hashable] = deque()
@@ -49,7 +49,7 @@ class _TurnQueue(Generic[Item]):
 
 
 class HandlerQueue(Generic[Item]):
-    """A queue with many producers and one consumer; items of one connection and urgency keep their order."""
+    """A queue with many producers and one consumer. Items of equal urgency from one connection stay in order."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.Lock())
@@ -59,10 +59,10 @@ class HandlerQueue(Generic[Item]):
         self._closed = False
 
     def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue an item of a connection, of which up to ``at_most`` may wait; urgent ones go first. Any thread.
+        """Queue a connection's item. At most ``at_most`` of its items may wait; urgent items go first. Any thread.
 
         Returns:
-            False if it was refused.
+            False if the item was refused.
         """
         with self._changed:
             queue = self._urgent if urgent else self._others
@@ -73,18 +73,18 @@ class HandlerQueue(Generic[Item]):
             return True
 
     def waiting(self, of: Hashable) -> int:
-        """Return the number of a connection's queued items that are not urgent."""
+        """Return how many of a connection's non-urgent items are queued."""
         with self._changed:
             return self._others.count(of)
 
     def close(self) -> None:
-        """Make :meth:`get` wait no longer; queued items are still returned."""
+        """Stop :meth:`get` from waiting; it still returns items already queued."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Item | None:
-        """Return the next item; None after the time-out, or if the queue is closed and empty."""
+        """Return the next item, or None after the time-out or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):

@@ -1,10 +1,10 @@
-"""The keys of the fabric transport: the key for each packet, and the keys that each role may use; pure functions.
+"""The keys of the fabric transport: the key for each packet, and the keys that each role may use. Pure functions.
 
-Since a packet that requests something must travel by the matching key, control of keys is control of actions.
+A packet that requests something must travel by the matching key, so controlling keys means controlling actions.
 
 ``docs/wire-format.md`` has the table. NAME is a proxy's name, WHO an application's identity (the common name of its
-certificate, ``anyone`` without keys), ID a connection: 16 random hexadecimal digits. TOPIC, CAMERA and VARIANT may be
-any text, so each is percent-encoded to one chunk of a key.
+certificate, ``anyone`` without keys), ID a connection (16 random hexadecimal digits). TOPIC, CAMERA and VARIANT may be
+arbitrary text, so each is percent-encoded to one chunk of a key.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ if TYPE_CHECKING:
     from skyloop.network.keys import Identity
 
 ROOT: Final = "skyloop/1"
-ANYONE: Final = "anyone"  #: WHO without keys
-PLAIN: Final = "-"  #: the variant of a camera's unchanged frames
-#: Identities: one chunk of a key, without wildcards.
+ANYONE: Final = "anyone"  #: WHO if there are no keys
+PLAIN: Final = "-"  #: the variant with a camera's unchanged frames
+#: Valid identities: one chunk of a key, without wildcards.
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
 
 # Keys that an application sends by, weakest right first.
-ASK: Final = "ask"  #: reliable; for observers, too
+ASK: Final = "ask"  #: reliable; also for observers
 ORDER: Final = "order"  #: reliable; only for pilots
 COMMAND: Final = "command"  #: best effort; the command channel
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: Requests allowed to observers. Any other one needs the right to order, which makes new requests safe by default.
+#: Requests that observers may send. Any other needs the right to order, so new kinds of requests are safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole head, as garbage keeps its order
-_POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may fly by it
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole head, because garbage must keep its order
+_POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may rely on it to fly
 
 
 class Sender(NamedTuple):
@@ -72,65 +72,65 @@ def new_id() -> str:
 
 
 def alive(name: str, run: str) -> str:
-    """Return the key of a transport server's liveliness token."""
+    """Return the key for a transport server's liveliness token."""
     return f"{ROOT}/{name}/alive/{run}"
 
 
 def info(name: str) -> str:
-    """Return the key at which a proxy describes itself."""
+    """Return the key under which a proxy describes itself."""
     return f"{ROOT}/{name}/info"
 
 
 def app(name: str, who: str, connection: str) -> str:
-    """Return the key of a connection's liveliness token."""
+    """Return the key for a connection's liveliness token."""
     return f"{ROOT}/{name}/app/{who}/{connection}"
 
 
 def join(name: str, who: str, connection: str) -> str:
-    """Return the key at which an application asks to join."""
+    """Return the key for an application's request to join."""
     return f"{ROOT}/{name}/join/{who}/{connection}"
 
 
 def upward(way: str, name: str, who: str, connection: str) -> str:
-    """Return the key by which an application sends packets in one of the :data:`WAYS`."""
+    """Return the key for packets from an application sent in one of the :data:`WAYS`."""
     return f"{ROOT}/{name}/{way}/{who}/{connection}"
 
 
 def to(name: str, connection: str) -> str:
-    """Return the key by which a proxy sends packets to one application."""
+    """Return the key for packets from a proxy to one application."""
     return f"{ROOT}/{name}/to/{connection}"
 
 
 def topic(name: str, topic_name: str) -> str:
-    """Return the key at which packets of a topic are published."""
+    """Return the key for published packets of a topic."""
     return f"{ROOT}/{name}/topic/{_chunk(topic_name)}"
 
 
 def newest_wins(topic_name: str) -> bool:
-    """Return whether only a topic's newest packet counts: it may be lost, and never waits for earlier ones."""
+    """Return whether only a topic's newest packet counts, so that it may be lost and never waits for earlier ones."""
     return topic_name.partition("?")[0] == FEEDBACK  # in any form
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key for frames of a variant, the part after the ``?`` of their topic."""
+    """Return the key for frames of a variant, which is the part after the ``?`` in their topic."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
 def video_for(name: str, camera: str, variant: str, connection: str) -> str:
-    """Return the key for frames to one application only, when another of the same variant can't keep up."""
+    """Return the key for frames to one application, used while another reader of the variant can't keep up."""
     return f"{video(name, camera, variant)}/{connection}"
 
 
 def downward(name: str) -> tuple[str, str, str]:
-    """Return the expressions of all keys by which a proxy sends packets and frames."""
+    """Return expressions for all keys by which a proxy sends packets and frames."""
     return to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"
 
 
 def parse_sender(key: str) -> Sender:
-    """Return a key's owner.
+    """Return the application that a key belongs to.
 
     Raises:
-        DecodeError: It is not an application's key.
+        DecodeError: The key is not an application's.
     """
     parts = key.split("/")
     if len(parts) == 6 and WHO.fullmatch(parts[4]) and ID.fullmatch(parts[5]):
@@ -139,10 +139,10 @@ def parse_sender(key: str) -> Sender:
 
 
 def parse_alive(key: str) -> tuple[str, str]:
-    """Return NAME and RUN of a transport server's token.
+    """Parse NAME and RUN from the key of a transport server's token.
 
     Raises:
-        DecodeError: It is not the key of such a token.
+        DecodeError: The key is not that of a transport server's token.
     """
     parts = key.split("/")
     if len(parts) == 5 and parts[3] == "alive" and NAME.fullmatch(parts[2]) and ID.fullmatch(parts[4]):
@@ -151,15 +151,15 @@ def parse_alive(key: str) -> tuple[str, str]:
 
 
 def parse_topic(key: str) -> str:
-    """Return the topic of a key made by :func:`topic`."""
+    """Return the topic from a key made by :func:`topic`."""
     return unquote(key.rpartition("/")[2])
 
 
 def check_identity(who: str) -> None:
-    """Check an identity.
+    """Check that an identity is valid.
 
     Raises:
-        UsageError: It is not valid as WHO.
+        UsageError: It can't be used as WHO.
     """
     if not WHO.fullmatch(who):
         raise UsageError(
@@ -171,9 +171,9 @@ def check_identity(who: str) -> None:
 
 
 def way_of(packet: bytes) -> str:
-    """Return the key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
+    """Return the kind of key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
 
-    Bytes that are no packet need no right, as nothing obeys them.
+    Bytes that are not a packet need no rights, because nothing acts on them.
     """
     kind = packet[5:6]
     if kind == _COMMAND:
@@ -190,15 +190,15 @@ def way_of(packet: bytes) -> str:
 
 
 def is_report(packet: bytes) -> bool:
-    """Return whether a packet reports the state of a stream: it may be lost, and is wrong when late."""
+    """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong if it arrives late."""
     return packet[:6] == _REPORT
 
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys don't allow, in place of sending it to the proxy.
+    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
 
     Returns:
-        The packet of the reply; None for a packet that is not a request.
+        The reply's packet; None if the packet is not a request.
     """
     try:
         sample = decode(packet)
@@ -211,10 +211,10 @@ def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None
 
 
 def allows(way: str, packet: bytes) -> bool:
-    """Return whether a packet may travel by the key by which it arrived."""
+    """Return whether a packet is allowed on the key on which it arrived."""
     return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 
 def _chunk(text: str) -> str:
-    """Encode any text as one chunk of a key, without ``/``, ``*``, ``$``, ``?`` and ``#``."""
+    """Encode arbitrary text as one chunk of a key, without ``/``, ``*``, ``$``, ``?`` and ``#``."""
     return quote(text, safe="=&,:")

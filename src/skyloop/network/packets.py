@@ -1,7 +1,7 @@
-"""The fabric transport's own packets and attachments: bytes to typed tuples and back, as pure functions.
+"""The fabric transport's own packets and attachments: convert bytes to typed tuples and back. Pure functions.
 
-They share the header of all packets and use kinds from 0x50 on, which no sample has. ``docs/wire-format.md`` has the
-tables.
+They share the header of all packets and use kinds from 0x50 up, which samples don't use. ``docs/wire-format.md`` has
+the tables.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from skyloop.transport.base import MAX_PACKET, MAX_TOPIC
 if TYPE_CHECKING:
     import zenoh
 
-REVISION: Final = 2  #: of the fabric transport
-MAX_REASON: Final = 400  #: bytes of UTF-8
-MAX_OWN: Final = 4096  #: bytes of a Join, a Welcome, a ProxyInfo or any attachment
+REVISION: Final = 2  #: revision of the fabric transport
+MAX_REASON: Final = 400  #: maximum length of a reason [bytes of UTF-8]
+MAX_OWN: Final = 4096  #: maximum size of a Join, a Welcome, a ProxyInfo or any attachment [bytes]
 
 
 class FabricKind(IntEnum):
-    """Kinds of packets that the two ends exchange with each other."""
+    """Kinds of packets that the transport's two ends exchange."""
 
     SUBSCRIBE = 0x50  #: application to proxy
-    TAKEN = 0x51  #: either way: packets up to this number were received
+    TAKEN = 0x51  #: either direction: packets up to this number were received
     SEEN = 0x52  #: application to proxy: frames up to this number were received
-    BYE = 0x53  #: either way: why the connection ends; answered with the same
+    BYE = 0x53  #: either direction: why the connection ends; answered with a BYE
     KEY = 0x54  #: proxy to application, sealed: the new key for topics and frames
 
 
@@ -45,7 +45,7 @@ class Subscribe(NamedTuple):
 class Taken(NamedTuple):
     """Acknowledges packets up to a number."""
 
-    topic: str  #: empty: packets sent to this end only
+    topic: str  #: empty for packets sent to this end only
     number: int
 
 
@@ -84,32 +84,32 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     """An application's request to join, as MessagePack."""
 
     revision: int
-    run: str  #: of the intended proxy
-    host: str = ""  #: for people
-    pid: int = 0  #: for people
-    program: str = ""  #: for people
-    proof: bytes = b""  #: with keys: the identity's proof, see :mod:`skyloop.network.keys.agreement`
+    run: str  #: run of the proxy that the request is meant for
+    host: str = ""  #: shown to users
+    pid: int = 0  #: shown to users
+    program: str = ""  #: shown to users
+    proof: bytes = b""  #: with keys: proof of the identity, see :mod:`skyloop.network.keys.agreement`
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
-    """The answer to :class:`Join`: the connection is established."""
+    """The answer to a :class:`Join`: the connection is established."""
 
     revision: int
     run: str
     proof: bytes = b""  #: with keys: the proxy's proof of identity
-    topics: bytes = b""  #: with keys: the packet of :class:`Key`, sealed for this connection
+    topics: bytes = b""  #: with keys: a :class:`Key` packet, sealed for this connection
 
 
 class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
-    """A proxy's description: the answer at its ``info`` key, as MessagePack."""
+    """A proxy's description of itself, sent as MessagePack when its ``info`` key is queried."""
 
     name: str
     run: str
-    since_ns: int  #: wall-clock time of its start [ns since 1970]; the older proxy keeps a name
+    since_ns: int  #: wall-clock time when it started [ns since 1970]; the older of two proxies keeps the name
     host: str
     pid: int
-    vehicle: str  #: its address, e.g. ``sim://``
-    address: str  #: where it listens, for people
+    vehicle: str  #: the vehicle's address, e.g. ``sim://``
+    address: str  #: where the proxy listens, shown to users
 
 
 encode_own = msgspec.msgpack.Encoder().encode
@@ -119,7 +119,7 @@ decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet may be for the transport itself rather than the handler."""
+    """Return whether a packet may be for the transport itself, rather than for the handler."""
     return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
 
 
@@ -156,7 +156,7 @@ def parse(packet: bytes) -> Message:
     """Decode one of the transport's own packets.
 
     Raises:
-        DecodeError: It is not one, or it is damaged.
+        DecodeError: It is not one of them, or it is damaged.
     """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are shorter than the header of {HEADER_SIZE}")
@@ -183,7 +183,7 @@ def parse(packet: bytes) -> Message:
 
 
 def parse_own(packet: bytes) -> Message | None:
-    """Decode one of the transport's own packets; return None for the handler's packets and for garbage."""
+    """Decode one of the transport's own packets; return None if it is for the handler or garbage."""
     if not is_own(packet):
         return None
     try:
@@ -203,10 +203,10 @@ def _topic(text: bytes, least: int = 0) -> str:
 
 
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
-    """Return bytes received by Zenoh; empty for None.
+    """Return a copy of bytes received by Zenoh; empty for None.
 
     Raises:
-        DecodeError: They are too large.
+        DecodeError: They exceed the maximum size.
     """
     if data is None:
         return b""
@@ -216,10 +216,10 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
-    """Return the packet and the attachment of a sample.
+    """Return a sample's packet and attachment.
 
     Raises:
-        DecodeError: It is empty or too large.
+        DecodeError: The packet is empty or too large.
     """
     if not sample.payload:
         raise DecodeError("it is empty")
@@ -228,15 +228,15 @@ def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, by
 
 # Attachments ---------------------------------------------------------------------------------------------------
 
-#: Attachment of a packet to one end: its number, from 1; 0 for the transport's own, which are not counted.
+#: Attachment of a packet sent to one end: its number, from 1; 0 for the transport's own packets, which are not counted.
 number = _NUMBER.pack
 
 
 def parse_number(attachment: bytes) -> int:
-    """Decode the attachment of a packet to one end.
+    """Decode the attachment of a packet sent to one end.
 
     Raises:
-        DecodeError: It is damaged.
+        DecodeError: The attachment is damaged.
     """
     try:
         return int(_NUMBER.unpack(attachment)[0])
@@ -245,7 +245,7 @@ def parse_number(attachment: bytes) -> int:
 
 
 def published(run: bytes, count: int) -> bytes:
-    """Encode a published packet's attachment: RUN of its proxy, 8 bytes, and its number on the topic, from 1."""
+    """Encode a published packet's attachment: the proxy's RUN (8 bytes) and its number on the topic, from 1."""
     return _PUBLISHED.pack(run, count)
 
 
@@ -253,7 +253,7 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
     """Decode a published packet's attachment: RUN and number.
 
     Raises:
-        DecodeError: It is damaged.
+        DecodeError: The attachment is damaged.
     """
     try:
         run, count = _PUBLISHED.unpack(attachment)
@@ -263,7 +263,7 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
 
 
 def frame(run: bytes, count: int, header: bytes) -> bytes:
-    """Encode a frame's attachment: RUN of its proxy, 8 bytes, its number, and the packet of its header."""
+    """Encode a frame's attachment: the proxy's RUN (8 bytes), the frame's number, and the packet of its header."""
     return _PUBLISHED.pack(run, count) + header
 
 
@@ -271,7 +271,7 @@ def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
     """Decode a frame's attachment: RUN, number and header.
 
     Raises:
-        DecodeError: It is damaged.
+        DecodeError: The attachment is damaged.
     """
     run, count = parse_published(attachment[: _PUBLISHED.size])
     header = decode(attachment[_PUBLISHED.size :])

@@ -1,6 +1,6 @@
-"""The connections of a proxy: admits applications, and ends connections.
+"""Keep a proxy's connections: admit applications and end connections.
 
-It ends those whose application is gone, has lost its rights, or acknowledges nothing.
+A connection is ended if its application is gone, has lost its rights, or acknowledges nothing.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import KeyRing
 
-CONFIRM_S: Final = 3.0  #: time for an admitted application to show its token
-#: Disconnect an application that acknowledges nothing for this long. Its end of the transport acknowledges at once,
-#: however slow the application's code is.
+CONFIRM_S: Final = 3.0  #: time for an admitted application to declare its token
+#: Disconnect an application that acknowledges nothing for this long. Its transport acknowledges at once, no matter how
+#: slow the application's own code is.
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
-#: For the thread that calls the handler: a packet, or True for joined, False for left.
+#: Items for the thread that calls the handler: a packet, True for joined, or False for left.
 Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
     """The connections of one transport server.
 
-    Thread-safe except for :meth:`check`, which belongs to the thread that calls the handler.
+    Thread-safe, except for :meth:`check`, which must be called on the handler's thread.
 
     Args:
         name: The proxy's name.
-        run: This run of the proxy.
+        run: The run of the proxy.
         ring: The proxy's keys; None without keys.
-        topic_keys: The seal of published packets; None without keys.
+        topic_keys: The seal for published packets; None without keys.
         publisher: The subscriptions.
-        sender: Sends to single applications.
-        queue: The queue of the thread that calls the handler.
-        excused_s: Time added to :data:`STALLED_S` before a silent application is disconnected [s].
+        sender: Sends packets to individual applications.
+        queue: The queue for the thread that calls the handler.
+        excused_s: Time to wait beyond :data:`STALLED_S` before disconnecting a silent application [s].
     """
 
     def __init__(
@@ -72,27 +72,27 @@ class ConnectionRegistry:
         self._sender = sender
         self._queue = queue
         self._stalled_s = STALLED_S + excused_s
-        self._lock = threading.RLock()  # guards what follows
+        self._lock = threading.RLock()  # guards the following attributes
         self._open = False
         self._tokens = Tokens(by_key=ring is not None)  # tokens of live connections
         self._connections: dict[str, ServerConnection] = {}
         self._peers: dict[int, ServerConnection] = {}
-        self._left = threading.Condition()  # notified when a connection has gone
+        self._left = threading.Condition()  # notified when a connection is gone
         self._last_id = 0
         self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
-        self.dropped = 0  #: applications disconnected because they acknowledged nothing
-        self.turned_away = 0  #: connections and tokens beyond the limits
-        self._away = ""  # why, until the handler was notified
-        self.strays = 0  #: samples and queries without a connection
-        self._stray_commands = 0  # commands and requests among them that the handler does not know of yet
+        self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
+        self.turned_away = 0  #: number of connections and tokens refused because of the limits
+        self._away = ""  # why, until the handler has been notified
+        self.strays = 0  #: number of samples and queries without a connection
+        self._stray_commands = 0  # commands and requests among them, not reported to the handler yet
 
     def open(self) -> None:
-        """Admit applications from now on."""
+        """Start admitting applications."""
         with self._lock:
             self._open = True
 
     def farewell(self, reason: str, within_s: float) -> None:
-        """Stop admitting, disconnect all applications, and wait until they have gone."""
+        """Stop admitting, disconnect all applications and wait until they are gone."""
         with self._lock:
             self._open = False
         for connection in self.connections:
@@ -104,18 +104,18 @@ class ConnectionRegistry:
 
     @property
     def connections(self) -> list[ServerConnection]:
-        """The present connections, as a copy."""
+        """The current connections, as a copy."""
         return list(self._connections.values())
 
     def of_peer(self, peer: Peer) -> ServerConnection | None:
-        """Return a peer's connection; None if it is gone."""
+        """Return a peer's connection, or None if it is gone."""
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
         """Return the connection that a key belongs to.
 
         Raises:
-            DecodeError: There is none with this id and identity.
+            DecodeError: No connection has this id and identity.
         """
         connection = self._connections.get(sender.id)
         if connection is None or connection.who != sender.who:
@@ -123,14 +123,14 @@ class ConnectionRegistry:
         return connection
 
     def is_shut_out(self, connection: ServerConnection) -> bool:
-        """Return whether a newer roster excludes a connection's key; if so, end the connection."""
+        """Return whether a newer roster excludes the key of a connection; if so, end the connection."""
         if self._ring is None or connection.who not in self._ring.shut_out:
             return False
         self._shut_out(connection, _SHUT_OUT)
         return True
 
     def stray(self, key: str) -> None:
-        """Count a packet without a connection, by the key by which it arrived."""
+        """Count a packet without a connection, given the key on which it arrived."""
         self.strays += 1
         if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive late
             self._stray_commands += 1
@@ -138,7 +138,7 @@ class ConnectionRegistry:
     # --- callbacks, on Zenoh's threads ---
 
     def on_token(self, sample: zenoh.Sample) -> None:
-        """Record that an application's token appeared or disappeared. On Zenoh's threads."""
+        """Record that an application's token appeared or disappeared. Called on Zenoh's threads."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
         except DecodeError:
@@ -158,7 +158,7 @@ class ConnectionRegistry:
             self.end(connection, f"the application is gone ({connection.peer.address})")
 
     def on_join(self, query: zenoh.Query) -> None:
-        """Answer an application's request to join. On Zenoh's threads."""
+        """Answer an application's request to join. Called on Zenoh's threads."""
         with query:
             try:
                 sender = layout.parse_sender(str(query.key_expr))
@@ -167,7 +167,7 @@ class ConnectionRegistry:
                 self.strays += 1
                 return
             if request.run != self._run:
-                return  # for another proxy of this name
+                return  # meant for another proxy with this name
             try:
                 admission = self._admit(sender, request)
                 problem = self._join(sender, request, admission)
@@ -182,10 +182,10 @@ class ConnectionRegistry:
                 self._send_topic_key(connection, self._topic_keys.newest)
 
     def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
-        """Check a request's keys.
+        """Check the keys in a request.
 
         Raises:
-            LinkError: It has no key for this drone.
+            LinkError: The application has no key for this drone.
         """
         if self._ring is not None and sender.who in self._ring.shut_out:
             raise LinkError(_SHUT_OUT)
@@ -193,14 +193,14 @@ class ConnectionRegistry:
         return admit(self._ring, self._name, self._run, sender, request, newest)
 
     def _join(self, sender: layout.Sender, request: packets.Join, admission: Admission) -> str:
-        """Admit an application; return why not, empty if it was admitted."""
+        """Admit an application; return why it was refused, or an empty string."""
         if request.revision != packets.REVISION:
             return f"it uses revision {request.revision} of the fabric transport, this proxy {packets.REVISION}"
         with self._lock:
             if not self._open:
                 return "the proxy is about to stop"
             if sender.id in self._connections:
-                before = self._connections[sender.id]  # a repeated request, or one that arrived on two paths
+                before = self._connections[sender.id]  # the request was repeated, or arrived on two paths
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
@@ -218,9 +218,9 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no room for one more connection of this identity.
+        """Return why there is no room for another connection of this identity.
 
-        Without keys only their total counts.
+        Without keys, only the total number is limited.
         """
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
@@ -239,10 +239,10 @@ class ConnectionRegistry:
     # --- periodic checks, on the thread that calls the handler ---
 
     def check(self, handler: ServerHandler) -> None:
-        """End invalid connections; call it periodically on the thread that calls the handler.
+        """End invalid connections. Must be called periodically on the thread that calls the handler.
 
-        Those are connections whose application never showed its token, acknowledges nothing, or has lost its rights.
-        The handler is notified of commands from unknown applications, and of refused connections.
+        A connection is invalid if its application never declared its token, acknowledges nothing, or has lost its
+        rights. Notify the handler of commands from unknown applications and of refused connections.
         """
         self._check_keys()
         commands, self._stray_commands = self._stray_commands, 0
@@ -259,9 +259,9 @@ class ConnectionRegistry:
                 self.drop(connection, f"it acknowledged nothing for {self._stalled_s:g} s")
 
     def _check_keys(self) -> None:
-        """End connections whose keys were excluded or have expired.
+        """End connections whose keys have been excluded or have expired.
 
-        If there were any, make a new key for published packets, which they can't read.
+        If there were any, create a new key for published packets, so that they can't read these any more.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:
@@ -293,7 +293,7 @@ class ConnectionRegistry:
     # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that must arrive; return False if the connection has ended, or this ends it. Any thread."""
+        """Send a packet that must arrive. Return False if the connection has ended or this ends it. Any thread."""
         if connection.ended:
             return False
         problem = connection.queue(packet)
@@ -304,7 +304,7 @@ class ConnectionRegistry:
         return True
 
     def send_own(self, connection: ServerConnection, packet: bytes) -> None:
-        """Send one of the transport's own packets that may be lost; :meth:`send` sends others. Any thread."""
+        """Send one of the transport's own packets, which may be lost; use :meth:`send` for others. Any thread."""
         connection.queue_own(packet)
         self._sender.wake(connection)
 
@@ -314,12 +314,12 @@ class ConnectionRegistry:
         self.disconnect(connection, reason)
 
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
-        """Disconnect an application; its unhandled packets are dropped. Any thread.
+        """Disconnect an application and drop its unhandled packets. Any thread.
 
         Args:
             connection: The application's connection.
-            reason: Why, for the application.
-            forget: Whether to remove the connection at once; else it is removed when the application answers, or when
+            reason: The reason, which is sent to the application.
+            forget: Whether to remove the connection at once; otherwise it is removed when the application answers or
                 its token disappears.
         """
         self._hang_up(connection, reason)
@@ -328,7 +328,7 @@ class ConnectionRegistry:
             self.end(connection, reason)
 
     def end(self, connection: ServerConnection, reason: str) -> None:
-        """Remove a connection; the handler is notified after the connection's last packet. Any thread."""
+        """Remove a connection. The handler is notified after the connection's last packet. Any thread."""
         with self._lock:
             if self._connections.pop(connection.id, None) is None:
                 return
@@ -340,7 +340,7 @@ class ConnectionRegistry:
             self._left.notify_all()
 
     def _shut_out(self, connection: ServerConnection, reason: str) -> None:
-        """Disconnect an application, but handle its earlier packets."""
+        """Disconnect an application, but still handle its earlier packets."""
         self._hang_up(connection, reason)
         self.end(connection, reason)
 

@@ -1,7 +1,7 @@
-"""End-to-end sealed packets: no node between a proxy and its applications can read, change or replay them.
+"""Seal packets end to end: no node between a proxy and its applications can read, change or replay them.
 
 The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
-Without keys nothing is sealed. ``docs/wire-format.md`` has the bytes.
+Without keys nothing is sealed. ``docs/wire-format.md`` describes the bytes.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 TAG: Final = 16  #: bytes that sealing adds to a payload
-_TRAILER = struct.Struct("<IQ")  # generation and number: at the end of the attachment, and the nonce
+_TRAILER = struct.Struct("<IQ")  # generation and number: appended to the attachment, and used as the nonce
 TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
-#: How late a packet may arrive: datagrams overtake resent packets, 100 a second for 10 s.
+#: How many packets late a packet may arrive: datagrams can overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
 GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
-#: A new topic key is used this long after it was sent, so that it arrives before the first packet sealed with it.
+#: How long after sending a new topic key it is first used, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """The seal and opener without keys: changes nothing."""
+    """Seal and opener for use without keys: changes nothing."""
 
     tag = trailer = 0
 
@@ -52,7 +52,7 @@ PLAIN: Final = Plain()
 
 
 class Seal:
-    """Seals with one numbered key of :data:`KEY_BYTES` bytes, and never uses a packet number twice."""
+    """Seals with a numbered key of :data:`KEY_BYTES` bytes, and never uses a packet number twice."""
 
     def __init__(self, key: bytes, generation: int = 0) -> None:
         self.key = key
@@ -61,11 +61,11 @@ class Seal:
         self._numbers = itertools.count(1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal a packet, and return the payload and the attachment to send. Any thread.
+        """Seal a packet; return the payload and the attachment to send. Any thread.
 
         Args:
-            where: The key that it will be sent by.
-            attachment: Sent beside it, authenticated but readable.
+            where: The key by which it will be sent.
+            attachment: Sent along with the packet, authenticated but not encrypted.
             data: The packet.
         """
         trailer = _TRAILER.pack(self.generation, next(self._numbers))
@@ -74,26 +74,26 @@ class Seal:
 
 
 class Open:
-    """Opens packets sealed by the other end's :class:`Seal`, once each. Any thread."""
+    """Opens packets sealed by the other end's :class:`Seal`, each only once. Any thread."""
 
     tag = TAG  #: bytes that sealing adds to a payload
     trailer = TRAILER  #: bytes that sealing adds to an attachment
 
     def __init__(self) -> None:
         self._ciphers: dict[int, ChaCha20Poly1305] = {}
-        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only of keys with an authentic packet
+        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only for keys that have opened an authentic packet
 
     def use(self, key: bytes, generation: int = 0) -> Open:
-        """Also open packets sealed with this key; keep the newest :data:`GENERATIONS` keys."""
+        """Also open packets sealed with this key. Only the newest :data:`GENERATIONS` keys are kept."""
         self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
         self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
         return self
 
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
-        """Return the packet and its attachment; None for a repeat, or one that can't be opened yet.
+        """Return the packet and its attachment, or None if it is a repeat or can't be opened yet.
 
         Raises:
-            DecodeError: The other end did not send this.
+            DecodeError: The packet did not come from the other end.
         """
         trailer = attachment[-TRAILER:]
         if len(trailer) < TRAILER:
@@ -115,13 +115,13 @@ class Open:
 
 
 def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """Open a sample like :meth:`Open.open`, without copying one that is too large.
+    """Open a sample like :meth:`Open.open`, but don't copy one that is too large.
 
     Returns:
-        The packet and the attachment; None for a repeat, or one that can't be opened yet.
+        The packet and the attachment; None if it is a repeat or can't be opened yet.
 
     Raises:
-        DecodeError: The other end did not send this, or it is empty or too large.
+        DecodeError: The sample did not come from the other end, or is empty or too large.
     """
     payload, attachment = packets.contents(sample, MAX_PACKET + opener.tag)
     opened = opener.open(str(sample.key_expr), attachment, payload)
@@ -131,9 +131,9 @@ def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] 
 
 
 class ReplayWindow:
-    """The numbers received, as in IPsec (RFC 4303).
+    """Keeps track of the numbers received, as in IPsec (RFC 4303).
 
-    Each number is new once, and one :data:`WIDTH` or more behind the newest never is. Thread-safe.
+    Each number is new only once; a number :data:`WIDTH` or more behind the newest is never new. Thread-safe.
     """
 
     def __init__(self) -> None:
@@ -156,7 +156,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals packets for all applications of a proxy, with a key that changes when one of them is excluded."""
+    """Seals packets for all of a proxy's applications, with a key that changes when one of them is excluded."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -165,24 +165,24 @@ class TopicSeal:
         self._since = 0.0
 
     def renew(self) -> None:
-        """Make a new key, :attr:`newest`, for all who stay; it is in use after :data:`SWITCH_S`.
+        """Create a new key, :attr:`newest`, for all remaining applications; it takes effect after :data:`SWITCH_S`.
 
-        A pending switch is not delayed by another one, which would let the first excluded application read on. Those
-        who stay may then miss packets until the newer key arrives.
+        A pending switch is not delayed by another one, because the first excluded application could go on reading. The
+        remaining ones may therefore miss packets until the newer key arrives.
         """
         if self._in_use is self.newest:
             self._since = self._clock() + SWITCH_S
         self.newest = Seal(os.urandom(KEY_BYTES), self.newest.generation + 1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal with the key in use; see :meth:`Seal.seal`."""
+        """Seal with the key currently in use; see :meth:`Seal.seal`."""
         if self._in_use is not self.newest and self._clock() >= self._since:
             self._in_use = self.newest
         return self._in_use.seal(where, attachment, data)
 
 
 def _cipher(key: bytes) -> ChaCha20Poly1305:
-    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # only with keys
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # imported only if there are keys
 
     return ChaCha20Poly1305(key)
 
@@ -194,9 +194,9 @@ def _forged() -> type[Exception]:
 
 
 def _bound(where: str, attachment: bytes) -> bytes:
-    """Return the bytes authenticated beside the data.
+    """Return the bytes that are authenticated along with the data.
 
-    No key holds a zero byte, so nothing can be moved between the two parts.
+    Keys contain no zero byte, so nothing can be shifted from one part to the other.
     """
     return where.encode() + b"\0" + attachment
 

@@ -1,8 +1,8 @@
 """The proxy's end of the fabric transport.
 
-Zenoh's threads only sort incoming packets. One thread of this end calls the handler, commands first, so that a slow
-handler delays no sign of life. Another one sends to single applications, so that one that acknowledges nothing delays
-no handler. No send ever blocks on an application.
+Zenoh's threads only sort incoming packets. A separate thread calls the handler, commands first, so that a slow handler
+does not delay signs of life. Another one sends to individual applications, so that an application that acknowledges
+nothing does not delay the handler. Sending never blocks on an application.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ if TYPE_CHECKING:
     import zenoh
 
 FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
-_POLL_S: Final = 0.5  # between checks of the connections
-_REFUSED: Final = b""  # stands for a refused packet
-_COMMAND: Final = b"c"  # stands for a command: the first one in the connection's backlog
+_POLL_S: Final = 0.5  # interval between checks of the connections
+_REFUSED: Final = b""  # represents a refused packet
+_COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
 _log = logging.getLogger(__name__)
 
 
 class FabricServer(TransportServer):
-    """A proxy's end, found on the network by its name. It can be started once.
+    """A proxy's end, which applications find on the network by its name. It can be started only once.
 
-    :meth:`start` raises :class:`NameTakenError` if a reachable proxy has the name, and :class:`LinkError` if the
-    network can't be joined.
+    :meth:`start` raises :class:`NameTakenError` if a reachable proxy already has the name, and :class:`LinkError` if
+    joining the network fails.
 
     Args:
         name: The proxy's name.
         settings: How to join the network; by default by multicast, without keys.
-        vehicle: The vehicle's address, which is sent to anybody who searches for the proxy.
+        vehicle: The vehicle's address, which is sent to anyone who searches for the proxy.
 
     Raises:
-        UsageError: The name is not valid, or the keys are not for it.
+        UsageError: The name is invalid, or the keys don't permit serving it.
         MissingExtraError: The extra ``network`` is not installed.
     """
 
@@ -65,7 +65,7 @@ class FabricServer(TransportServer):
         ring = self._settings.ring
         topic_keys = None if ring is None else TopicSeal()
         self._commands_lock = threading.Lock()  # guards the connections' backlogs of commands
-        self._superseded = 0  # number of queued commands superseded by newer ones
+        self._superseded = 0  # number of queued commands that newer ones have superseded
         self._queue: HandlerQueue[Item] = HandlerQueue()
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
@@ -81,11 +81,11 @@ class FabricServer(TransportServer):
         )
         self._lock = threading.Lock()  # guards starting and stopping
         self._started = False
-        self._since_ns = 0  # wall-clock time of the start
+        self._since_ns = 0  # wall-clock time when it started
         self._session: Session | None = None
         self._declared: list[Any] = []
         self._thread: threading.Thread | None = None
-        self.refused = 0  #: packets whose key does not allow them
+        self.refused = 0  #: number of packets not allowed on their key
 
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
@@ -159,7 +159,7 @@ class FabricServer(TransportServer):
         return self._publisher.publish_frame(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, of its frames in all forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -184,7 +184,7 @@ class FabricServer(TransportServer):
 
     @property
     def strays(self) -> int:
-        """Samples and queries without a connection."""
+        """Number of samples and queries without a connection."""
         return self._registry.strays
 
     @property
@@ -194,7 +194,7 @@ class FabricServer(TransportServer):
         return f"fabric:{self._name}" + (f" ({', '.join(listens)})" if listens else "")
 
     def _put_to(self, connection: ServerConnection, packet: bytes, number: int) -> bool:
-        """Send a packet to one application. On the sender's thread."""
+        """Send a packet to one application. Called on the sender's thread."""
         z, session = load(), self._session
         if session is None:
             return False
@@ -232,7 +232,7 @@ class FabricServer(TransportServer):
                 return
             opened = contents(connection.admission.opener, sample)
             if opened is None:
-                return  # it already arrived on another path
+                return  # already received on another path
             packet, attachment = opened
             number = packets.parse_number(attachment)
         except DecodeError:
@@ -268,11 +268,11 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # else it takes the turn of the previous one
+        if not superseded:  # otherwise it takes the previous one's turn
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False for one left to the handler (garbage)."""
+        """Handle one of the transport's own packets; return False if it is left to the handler (garbage)."""
         if isinstance(message, packets.Taken):
             if connection.took(message.topic, message.number, time.monotonic()):
                 self._sender.wake(connection)
@@ -281,7 +281,7 @@ class FabricServer(TransportServer):
         elif isinstance(message, packets.Subscribe):
             return self._publisher.subscribe(connection, message)
         elif isinstance(message, packets.Key):
-            return False  # only proxies send these
+            return False  # only proxies send packets of these kinds
         else:
             self._registry.send_own(connection, packets.bye(message.reason))
             self._registry.end(connection, message.reason)
@@ -327,12 +327,12 @@ class FabricServer(TransportServer):
             handler.refused(connection.peer, "it sent a packet that its keys do not allow")
             return
         message = packets.parse_own(packet)
-        if isinstance(message, packets.Subscribe):  # it had failed
+        if isinstance(message, packets.Subscribe):  # subscribing had failed
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
 
 
 def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
-    """Return a proxy's end for this host and the network; the other arguments are a :class:`FabricServer`'s."""
+    """Return a proxy's end for both this host and the network; other arguments are those of :class:`FabricServer`."""
     return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

@@ -1,4 +1,4 @@
-"""This process's Zenoh sessions: one for all connections with the same settings, to any number of drones."""
+"""This process's Zenoh sessions: connections with the same settings share one, for any number of drones."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = 2.0  #: an unused session stays open this long, for clients that reconnect
-REOPEN_S: Final = 2.0  #: time for an address to become free again
-CLOSE_S: Final = 5.0  #: how long the process's exit waits for a session to close
-_BORROWED: Final = 1000  # retries when another thread is using the object …
-_BORROWED_S: Final = 0.001  # … after this pause
-#: Parts of Zenoh's errors: the place in its sources, and its additions to an endpoint's address.
+LINGER_S: Final = 2.0  #: an unused session stays open this long for clients that reconnect
+REOPEN_S: Final = 2.0  #: time to wait for an address to become free again
+CLOSE_S: Final = 5.0  #: time that the process waits at exit for a session to close
+_BORROWED: Final = 1000  # number of retries when another thread is using the object …
+_BORROWED_S: Final = 0.001  # … and the pause between them
+#: Parts of Zenoh's error texts: positions in its source code, and what it adds to an endpoint's address.
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
-_ATTEMPTS: Final = 5  # to get a free port before another process takes it
+_ATTEMPTS: Final = 5  # attempts to get a free port before another process takes it
 
 
 class Session:
-    """One shared Zenoh session; return it with :func:`release`.
+    """A shared Zenoh session; give it back with :func:`release`.
 
     Raises:
-        LinkError: The network can't be joined.
+        LinkError: Joining the network failed.
         MissingExtraError: The extra ``network`` is not installed.
     """
 
@@ -45,42 +45,42 @@ class Session:
         self.settings = settings
         self.part = part
         self.users = 0
-        self.retired = False  #: not for new users: there is a better one
+        self.retired = False  #: not given to new users, because there is a better one
         self.idle_since = 0.0
         self.opened = time.monotonic()
-        self.listens: list[str] = []  #: addresses
+        self.listens: list[str] = []  #: addresses it listens on
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """Wrap a function that Zenoh calls on its receiving thread with each sample, reply or query.
+        """Wrap a function that Zenoh calls on its receiving thread for each sample, reply or query.
 
-        It must be quick.
+        The function must return quickly.
         """
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
 
     def peers(self) -> set[str]:
-        """Return the common names in the certificates of all linked nodes; none without keys."""
+        """Return the common names in the certificates of all linked nodes; empty without keys."""
         try:
             return {link.auth_identifier or "" for link in self.zenoh.info.links()} - {""}
-        except load().ZError:  # it is closed
+        except load().ZError:  # the session is closed
             return set()
 
     def shut_out(self) -> frozenset[str]:
         """Return the linked nodes that the newest roster excludes.
 
-        Zenoh itself applies the roster with which the session started.
+        Zenoh itself still applies the roster with which the session started.
         """
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
     def over(self, now: float) -> bool:
-        """Return whether it has lingered long enough without a user. For the pool."""
+        """Return whether it has been unused for long enough. For use by the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
-        """Close the Zenoh session. For the pool."""
+        """Close the Zenoh session. For use by the pool."""
         try:
             self.zenoh.close()  # type: ignore[no-untyped-call]
         except Exception as error:  # noqa: BLE001  (nothing more can be done)
@@ -95,37 +95,37 @@ class Session:
             try:
                 return zenoh_module.open(configure(sections))
             except zenoh_module.ZError as error:
-                # Another process may have taken the free port: only then can another attempt help.
+                # Another process may have taken the free port; only in that case can another attempt help.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
                     raise LinkError(f"cannot join the network: {reason_of(error)}") from None
         raise AssertionError("unreachable")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the text of a Zenoh error, without places in its sources and the internal form of endpoints."""
+    """Return the text of a Zenoh error, without positions in its source code and the internal form of endpoints."""
     text = _PLACE.sub("", str(error))
     return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is unknown")
 
 
 class _Pool:
-    """All sessions of this process.
+    """All of this process's sessions.
 
-    A thread closes unused ones, and ends when there are none.
+    A thread closes unused sessions, and ends when there are none.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
-        self._closing = 0  # sessions being closed, and no longer in the list
+        self._closing = 0  # number of sessions that are being closed and no longer in the list
         self._over = False  # the process is exiting
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
-        """Return a session with these settings, opening one if there is none.
+        """Return a session with these settings, opening one if necessary.
 
         Raises:
-            LinkError: The network can't be joined.
-            UsageError: An address is not valid.
+            LinkError: Joining the network failed.
+            UsageError: An address is invalid.
             MissingExtraError: The extra ``network`` is not installed.
         """
         with self._changed:
@@ -142,7 +142,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back; it stays open for :data:`LINGER_S` without users if it may linger."""
+        """Give a session back. Once unused, it stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -157,16 +157,16 @@ class _Pool:
             self._close(session)
 
     def retire(self, session: Session) -> None:
-        """Give new users another session from now on; this one ends with its last user."""
+        """Give new users another session from now on; this one closes after its last user."""
         with self._changed:
             session.retired = True
 
     def close_all(self) -> None:
-        """Close all sessions at the end of the process.
+        """Close all sessions when the process ends.
 
-        Zenoh's threads must not call into an interpreter that is gone. Nor may a thread of ours be inside Zenoh then:
-        on its return to Python it ends by an exception that native code does not let pass, which aborts the process
-        ("FATAL: exception not rethrown").
+        Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh: on
+        returning to Python it would be ended by an exception that can't pass through native code, which aborts the
+        process ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -177,12 +177,12 @@ class _Pool:
             self._changed.wait_for(lambda: not self._closing, CLOSE_S)
 
     def _take_out(self, session: Session) -> None:
-        """Start closing a session; with the lock held. Then call :meth:`_close`."""
+        """Start closing a session, with the lock held. The caller must then call :meth:`_close`."""
         self._sessions.remove(session)
         self._closing += 1
 
     def _close(self, session: Session) -> None:
-        """Close a session outside the lock, as it may wait for the network."""
+        """Close a session outside the lock, because it may wait for the network."""
         try:
             session.close()
         finally:
@@ -213,7 +213,7 @@ retire = _POOL.retire
 
 
 def _close_all(process: int) -> None:
-    if process == os.getpid():  # a fork has none of the sessions' threads
+    if process == os.getpid():  # a forked process has none of the sessions' threads
         _POOL.close_all()
 
 
@@ -221,10 +221,10 @@ atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:
-    """Import and return the package zenoh.
+    """Import the package zenoh and return it.
 
     Raises:
-        MissingExtraError: It is not installed.
+        MissingExtraError: The package is not installed.
     """
     try:
         import zenoh
@@ -234,14 +234,14 @@ def load() -> Any:
 
 
 def host_name() -> str:
-    """Return the name of this host, for people."""
+    """Return this host's name, for users."""
     return platform.node()[:64] or "?"
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session without other users by one at the same addresses with the newest roster.
+    """Replace a session that has no other users by one at the same addresses with the newest roster.
 
-    All its links end and are re-established.
+    All its links are closed and re-established.
 
     Raises:
         LinkError: The keys were revoked, or an address does not become free again within :data:`REOPEN_S`.
@@ -252,14 +252,14 @@ def renewed(session: Session) -> Session:
     while True:
         try:
             return acquire(settings, session.part)
-        except LinkError:  # the ports become free in a moment
+        except LinkError:  # the ports will become free in a moment
             if time.monotonic() > deadline:
                 raise
             time.sleep(_BORROWED_S)
 
 
 def undeclare(held: Iterable[Any]) -> None:
-    """Undeclare a session's declarations, last first. Not on Zenoh's threads."""
+    """Undeclare a session's declarations, last first. Must not be called on Zenoh's threads."""
     ended: type[Exception] = load().ZError
     for each in reversed([*held]):
         for _ in range(_BORROWED):

@@ -1,4 +1,4 @@
-"""A topic that an application subscribed to: its packets or frames that wait for the handler."""
+"""A topic that an application has subscribed to, and its packets or frames that wait for the handler."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _VIDEO: Final = video("")
 
 
 class Subscription:
-    """Sorts a topic's packets on Zenoh's threads, and delivers them on the receiving thread.
+    """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
 
     Args:
-        topic: A topic of packets, or of a camera's frames in one form.
-        run: The proxy's run: packets that others publish under its name are ignored.
+        topic: A topic with packets, or with a camera's frames in one form.
+        run: The proxy's run. Packets that others publish under its name are ignored.
         opener: Opens the proxy's packets.
-        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number, which must be passed to
+        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number; these must be passed to
             :meth:`deliver` in order.
-        reject: Called with the reason when a packet is not the proxy's.
+        reject: Called with the reason when a packet did not come from the proxy.
     """
 
     def __init__(
@@ -49,17 +49,17 @@ class Subscription:
         self._opener = opener
         self._enqueue = enqueue
         self._reject = reject
-        #: Whether only the newest packet counts: it and its acknowledgement are sent as datagrams.
+        #: Whether only the newest packet counts, so that packets and their acknowledgements are sent as datagrams.
         self.newest_wins = layout.newest_wins(topic)
         self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
         self._recent = RecentPackets()
-        self._waiting = 0  # packets
+        self._waiting = 0  # number of waiting packets
         self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
         self._newest = 0  # number of the newest frame received
         self._ended = False
 
     def declare(self, session: Session, name: str, connection: str) -> list[Any]:
-        """Subscribe on a Zenoh session, and return the declarations, for the caller to undeclare."""
+        """Subscribe on a Zenoh session. The caller must undeclare the returned declarations."""
         z, call, topic = session.zenoh, session.callback, self._topic
         if not topic.startswith(_VIDEO):
             return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
@@ -75,7 +75,7 @@ class Subscription:
         """Deliver the next item to the handler.
 
         Returns:
-            The packet that acknowledges it to the proxy; empty for none.
+            The packet that acknowledges it to the proxy; empty if none is needed.
         """
         if packet:
             self._waiting -= 1
@@ -104,7 +104,7 @@ class Subscription:
             self._enqueue(self, packet, number)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        """Queue a frame; it replaces a queued one."""
+        """Queue a frame, replacing one that is already queued."""
         opener = self._opener
         try:
             attachment = packets.copied(sample.attachment, packets.MAX_OWN)

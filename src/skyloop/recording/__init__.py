@@ -1,4 +1,4 @@
-"""Recordings of flights: written by :func:`record`, to MCAP files that other viewers can open too."""
+"""Flight recordings: :func:`record` writes them to MCAP files, which other viewers can open too."""
 
 from __future__ import annotations
 

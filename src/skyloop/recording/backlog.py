@@ -1,4 +1,4 @@
-"""A bounded backlog of samples not written yet; when full, it drops frames first, then feedback."""
+"""A bounded backlog of samples waiting to be written; when it is full, frames are dropped first, then feedback."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any, Final
 
 from skyloop.recording.options import MB
 
-RESERVE: Final = 64 * MB  #: bytes beyond the limit, for samples that must not be dropped
+RESERVE: Final = 64 * MB  #: bytes above the limit, reserved for samples that must not be dropped
 
 
 class Rank(IntEnum):
-    """Drop order: the highest rank is dropped first."""
+    """The order of dropping: samples of the highest rank are dropped first."""
 
-    KEPT = 0  #: commands, events, parameters, logs: dropped only when the reserve is full, too
+    KEPT = 0  #: commands, events, parameters, logs: dropped only if the reserve is full as well
     STATE = 1  #: feedback, annotations
     FRAME = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A sample to write: from :mod:`skyloop.messages` or the layout, or an encoded frame."""
+    """A sample to write: a type from :mod:`skyloop.messages`, one from the layout, or an encoded frame."""
 
     drone: int  #: the drone's index in the recording
-    channel: str  #: the channel's name in the counts: ``feedback``, ``video.front`` …
+    channel: str  #: the channel's name in the drop counts: ``feedback``, ``video.front`` …
     rank: Rank
     received_ns: int  #: on this process's monotonic clock
     sample: Any
@@ -39,14 +39,14 @@ Counts = Counter[tuple[int, str]]
 
 
 class Backlog:
-    """A bounded queue in order of arrival, for any number of producers and one consumer.
+    """A bounded first-in, first-out queue with any number of producers and one consumer.
 
     Attributes:
         dropped: Counts of dropped items.
     """
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
-        """Limit frames and feedback to ``limit`` bytes, and the rest to ``reserve`` bytes more."""
+        """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` bytes more."""
         self.dropped: Counts = Counter()
         self._limit = limit
         self._ceiling = limit + reserve
@@ -57,11 +57,11 @@ class Backlog:
 
     @property
     def size(self) -> int:
-        """Bytes waiting."""
+        """Bytes waiting to be written."""
         return self._size
 
     def put(self, item: Item) -> None:
-        """Append an item; if the backlog is full, drop and count the oldest of the highest rank."""
+        """Append an item; if the backlog is full, drop and count the oldest item of the highest rank."""
         with self._lock:
             self._number += 1
             self._queues[item.rank].append((self._number, item))
@@ -70,7 +70,7 @@ class Backlog:
                 self._make_room()
 
     def put_back(self, items: Iterable[Item]) -> None:
-        """Return the items taken last, which could not be written, to the front, in order."""
+        """Return the most recently taken items, which could not be written, to the front in their original order."""
         with self._lock:
             first = self._first()
             for number, item in enumerate(reversed(list(items)), 1):
@@ -79,7 +79,7 @@ class Backlog:
             self._make_room()
 
     def take(self, size: int) -> list[Item]:
-        """Remove and return the oldest items up to this size [bytes], in order of arrival. Does not wait."""
+        """Remove and return the oldest items, up to ``size`` bytes in total, in order of arrival. Does not block."""
         taken: list[Item] = []
         with self._lock:
             while size > 0:
@@ -93,7 +93,7 @@ class Backlog:
         return taken
 
     def count(self, item: Item) -> None:
-        """Count an item dropped elsewhere."""
+        """Count an item that was dropped elsewhere."""
         with self._lock:
             self.dropped[item.drone, item.channel] += 1
 
@@ -104,6 +104,6 @@ class Backlog:
         kept, state, frames = self._queues
         for queue, limit in ((frames, self._limit), (state, self._limit), (kept, self._ceiling)):
             while self._size > limit and queue:
-                _, item = queue.popleft()  # the oldest, so that the newer ones have no gap
+                _, item = queue.popleft()  # drop the oldest, so that the newer ones stay contiguous
                 self._size -= item.size
                 self.dropped[item.drone, item.channel] += 1

@@ -1,4 +1,4 @@
-"""The recorder within a process: subscriptions to drones, a backlog and the writing thread."""
+"""The in-process recorder: subscriptions to drones, a backlog and the writing thread."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Engine:
         on_event: Callable[[RecorderEvent], None] = lambda _: None,
         **writing: Any,
     ) -> None:
-        """Initialise the recorder without opening a file; ``on_event`` is called on the writing thread.
+        """Initialise the recorder without opening a file. ``on_event`` is called on the writing thread.
 
         Raises:
             UsageError: Two drones have the same name.
-            UnknownNameError: The options name a camera that no drone has.
+            UnknownNameError: No drone has a camera named in the options.
         """
         check_names(drones, "recording")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
@@ -64,7 +64,7 @@ class Engine:
 
         Raises:
             UsageError: The file can't be written.
-            SkyloopError: A drone can't be subscribed to; the file is then closed.
+            SkyloopError: Subscribing to a drone failed; the file has been closed.
         """
         self._writer.start()
         try:
@@ -76,7 +76,7 @@ class Engine:
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """In a child made by ``os.fork``: leave the file to the parent process."""
+        """Leave the file to the parent process. Called in a child created by ``os.fork``."""
         self._ended_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:
@@ -90,7 +90,7 @@ class Engine:
 
     @property
     def status(self) -> Status:
-        """The current status. Can be read from any thread."""
+        """The current status. Safe to read from any thread."""
         writer = self._writer
         return Status(
             writer.state,

@@ -1,6 +1,6 @@
-"""Messages for viewers in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
+"""Encode messages in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, text.
 
-Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
+Pure. Needs the extra ``record``. Times are in Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def timestamp(unix_ns: int) -> Timestamp:
 
 
 def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) -> bytes:
-    """Encode an image file (``jpeg`` or ``png``) captured at this Unix time."""
+    """Encode an image file (``jpeg`` or ``png``) captured at the given Unix time."""
     message = CompressedImage(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
     )
@@ -90,7 +90,7 @@ def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) 
 
 
 def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
-    """Encode one frame of H.264: an access unit in Annex B form, with SPS and PPS if it is a key frame."""
+    """Encode one H.264 frame: an access unit in Annex B format, with SPS and PPS if it is a key frame."""
     message = CompressedVideo(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=H264
     )
@@ -98,7 +98,7 @@ def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
 
 
 def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, intrinsics: Intrinsics) -> bytes:
-    """Encode a camera's intrinsics for images of this size [px]."""
+    """Encode a camera's intrinsics for images of the given size [px]."""
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     message = CameraCalibration(
         timestamp=timestamp(at_ns),
@@ -115,7 +115,7 @@ def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, in
 
 
 def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
-    """Return the coefficients of the viewers' model: 4 for a fisheye, 5 for a pinhole."""
+    """Return the distortion coefficients that viewers expect: 4 for a fisheye, 5 for a pinhole camera."""
     wanted = 4 if intrinsics.model == "fisheye" else 5
     given = intrinsics.distortion
     return given if len(given) > wanted else (*given, *[0.0] * (wanted - len(given)))
@@ -125,9 +125,9 @@ def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
 
 
 def pose(feedback: Feedback) -> Pose | None:
-    """Return the vehicle's pose in world axes; None while the attitude is unknown.
+    """Return the vehicle's pose in world axes, or None while its attitude is unknown.
 
-    Without a position, place it above the origin at its altitude, so that attitude and height still show.
+    If the position is unknown, place it above the origin at its altitude, to show at least attitude and height.
     """
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None
@@ -138,13 +138,13 @@ def pose(feedback: Feedback) -> Pose | None:
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the quaternion of the rotation Rz(yaw) · Ry(pitch) · Rx(roll), angles in rad."""
+    """Return the quaternion of the rotation Rz(yaw) · Ry(pitch) · Rx(roll); angles in rad."""
     x, y, z, w = quaternion_from_euler(roll, pitch, yaw)
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def pose_of(values: Sequence[float]) -> Pose:
-    """Return the pose of a position [m] and a quaternion: x, y, z, then qx, qy, qz, qw."""
+    """Build a pose from a position [m] and a quaternion, given as x, y, z, qx, qy, qz, qw."""
     x, y, z, qx, qy, qz, qw = values[:7]
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
@@ -160,12 +160,12 @@ def path_in_world(at_ns: int, places: Iterable[Pose]) -> bytes:
 
 
 def world_to_drone(drone: str, at_ns: int, place: Pose) -> bytes:
-    """Encode the transform from the world to a drone."""
+    """Encode the transform from the world frame to a drone's frame."""
     return _transform(WORLD, drone, at_ns, place.position, place.orientation)
 
 
 def drone_to_camera(drone: str, camera: CameraInfo, at_ns: int) -> bytes | None:
-    """Encode a camera's mounting; None if it is unknown."""
+    """Encode a camera's mounting, or return None if it is unknown."""
     if camera.rotation is None:
         return None
     import numpy as np
@@ -191,7 +191,7 @@ def _transform(parent: str, child: str, at_ns: int, translation: Vector3, rotati
 
 
 def drawing(annotation: Annotation, captured_ns: int) -> bytes:
-    """Encode the drawing on a frame captured at this Unix time."""
+    """Encode the drawing on a frame captured at the given Unix time."""
     message = ImageAnnotations()
     at = timestamp(captured_ns)
     for shape in annotation.shapes:
@@ -229,6 +229,6 @@ def _colour(colour: Colour) -> Color:
 
 
 def log(drone: str, at_ns: int, severity: Severity, text: str, source: str) -> bytes:
-    """Encode a line of text."""
+    """Encode a line of log text."""
     message = Log(timestamp=timestamp(at_ns), level=_LEVELS[severity], message=text, name=drone, file=source)
     return message.SerializeToString()

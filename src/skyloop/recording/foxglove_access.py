@@ -1,6 +1,6 @@
-"""Access of Foxglove's viewers: which web pages can connect, and reading and writing the drones' parameters.
+"""Access control for Foxglove viewers: which web pages may connect, and how viewers read and write parameters.
 
-Any viewer can read parameters; a write briefly acquires a lease.
+Any viewer can read parameters; writing one briefly acquires a lease.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ LOOKS_ONLY: Final = "this view is read-only: start it with --write to write para
 class Written:
     """The result of writing a parameter."""
 
-    name: str  #: including the drone's name
-    value: Value | None  #: the current value; None if it can't be read
-    refused: str = ""  #: why it was not written
+    name: str  #: parameter name, prefixed with the drone's name
+    value: Value | None  #: the current value; None if it could not be read
+    refused: str = ""  #: why the write was refused; empty if it succeeded
 
 
 class ParameterAccess:
-    """Reads and writes parameters by names such as ``alpha/limits.tilt``. Can be used from any thread."""
+    """Reads and writes parameters by names such as ``alpha/limits.tilt``. Safe to use from any thread."""
 
     def __init__(
         self,
@@ -46,22 +46,22 @@ class ParameterAccess:
         priority: int | None,
         on_change: Callable[[str, Value], None] = lambda *_: None,
     ) -> None:
-        """Initialise without a request.
+        """Initialise without sending any request.
 
         Args:
-            drones: Observed drones, with different names.
-            priority: Priority of writes, 0 (the highest) to 31; None forbids writing.
-            on_change: Called with the name and value of each parameter at first and after each change, once
-                :meth:`follow` was called, on a separate thread.
+            drones: Observed drones, with distinct names.
+            priority: Priority used for writes, 0 (the highest) to 31; None forbids writing.
+            on_change: Called with a parameter's name and value on a separate thread: once for each parameter when
+                :meth:`follow` is called, then after each change.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
         self._on_change = on_change
-        self._lock = threading.Lock()  # serialises writes, and the start
+        self._lock = threading.Lock()  # serialises writes and starting to follow
         self._following: list[tuple[Parameters, Listener[Event]]] = []
 
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
-        """Return the values of these parameters, or of all. Wait up to 2 s for a drone that does not answer.
+        """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not answer.
 
         Raises:
             SkyloopError: A drone does not answer.
@@ -77,7 +77,7 @@ class ParameterAccess:
         return {name: value for name, value in found.items() if not wanted or name in wanted}
 
     def write(self, name: str, value: object) -> Written:
-        """Write a parameter and return its resulting value."""
+        """Write a parameter and return the value it has afterwards."""
         refused = ""
         with self._lock:
             try:
@@ -87,7 +87,7 @@ class ParameterAccess:
             return Written(name, self._present(name), refused)
 
     def follow(self) -> None:
-        """Report every parameter, and then each change. Idempotent."""
+        """Report every parameter, then every change. Idempotent."""
         with self._lock:
             if self._following:
                 return
@@ -97,7 +97,7 @@ class ParameterAccess:
                 followed.start()
 
     def close(self) -> None:
-        """Stop following changes."""
+        """Stop reporting changes."""
         for followed, listener in self._following:
             listener.cancel()
             followed.stop()
@@ -129,7 +129,7 @@ class ParameterAccess:
 
 
 def _typed(parameter: Parameter, value: object) -> object:
-    """Return a viewer's value as the parameter's type: viewers write 1 for 1.0."""
+    """Convert a viewer's value to the parameter's type: viewers send 1 for 1.0."""
     if parameter.type is ParameterType.FLOAT and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if parameter.type is ParameterType.INT and isinstance(value, float) and value.is_integer():
@@ -140,8 +140,8 @@ def _typed(parameter: Parameter, value: object) -> object:
 # Origins --------------------------------------------------------------------------------------------------------
 
 
-MAX_HEAD: Final = 16_384  #: bytes of a request's head
-HEAD_S: Final = 5.0  #: time limit for receiving it
+MAX_HEAD: Final = 16_384  #: maximum size of a request's head [bytes]
+HEAD_S: Final = 5.0  #: time limit for receiving a request's head
 _CHUNK: Final = 1 << 16
 _ORIGIN: Final = re.compile(rb"^origin[ \t]*:[ \t]*(.*?)[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
 _FOXGLOVE: Final = "foxglove.dev"
@@ -152,36 +152,36 @@ _REFUSED: Final = (
 
 
 def is_trusted(origin: str) -> bool:
-    """Return whether a page may connect: Foxglove's, in a browser or as an application, or a local one."""
+    """Return whether a page may connect: Foxglove's web page or desktop application, or a local page."""
     parts = urlsplit(origin)
     name = parts.hostname or ""
     if parts.scheme == "https" and (name == _FOXGLOVE or name.endswith(f".{_FOXGLOVE}")):
         return True
     if parts.scheme in ("http", "https"):
         return is_loopback(name)
-    return parts.scheme == "file"  # the application's own; "null" can be any page
+    return parts.scheme == "file"  # Foxglove's desktop application; the origin "null" could be any page
 
 
 def hidden_host() -> str:
-    """Return a random loopback address that a page can't find by trying ports."""
+    """Return a random loopback address, which a page can't find by scanning ports."""
     if sys.platform != "linux":
         return "127.0.0.1"
     return str(ipaddress.IPv4Address((127 << 24) + random.SystemRandom().randrange(1 << 16, 1 << 24)))
 
 
 class OriginGuard:
-    """Listens until :meth:`close` and forwards connections of trusted origins to the server.
+    """Listens until :meth:`close` and forwards connections from trusted origins to the server.
 
     Args:
         host: Address to listen on.
-        port: Port to listen on; 0 takes a free one.
+        port: Port to listen on; 0 picks a free one.
 
     Attributes:
-        port: The port.
-        behind: Address and port of the server; set before the port is announced.
+        port: The port it listens on.
+        behind: Address and port of the server behind it; set before the port is announced.
 
     Raises:
-        OSError: The address can't be listened on.
+        OSError: Listening on the address failed.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -208,7 +208,7 @@ class OriginGuard:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop accepting connections. Existing ones end with the server."""
+        """Stop accepting connections. Existing ones end when the server does."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -235,7 +235,7 @@ class OriginGuard:
 
 
 def _pump(source: socket.socket, target: socket.socket) -> None:
-    """Copy bytes until either end closes, then shut down both."""
+    """Copy bytes until either socket closes, then shut down both."""
     with contextlib.suppress(OSError):
         while data := source.recv(_CHUNK):
             target.sendall(data)

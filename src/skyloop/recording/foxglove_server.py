@@ -1,7 +1,7 @@
-"""A WebSocket server for Foxglove: live topics in the schemas of recordings, and the drones' parameters.
+"""A WebSocket server for Foxglove: live topics with the same schemas as recordings, and the drones' parameters.
 
-It uses the protocol of https://github.com/foxglove/ws-protocol from the ``foxglove-sdk``, which sends on its own
-threads and drops the oldest messages of a viewer that does not read.
+The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends on its own threads and
+drops the oldest messages for a viewer that does not read.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.view import Source
 
 PORT: Final = 8765  #: Foxglove's default
-WAITING: Final = 512  #: messages that can wait for a viewer before its oldest are dropped
+WAITING: Final = 512  #: messages queued per viewer before its oldest are dropped
 
 
 class FoxgloveServer:
-    """A :class:`skyloop.recording.view.Screen` of any number of viewers."""
+    """A :class:`skyloop.recording.view.Screen` that serves any number of viewers."""
 
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
@@ -43,14 +43,14 @@ class FoxgloveServer:
         """Start listening.
 
         Args:
-            drones: Connected drones, with different names.
+            drones: Connected drones, with distinct names.
             host: Address to listen on.
-            port: Port to listen on; 0 takes a free one.
-            priority: Priority of viewers' parameter writes, 0 (the highest) to 31; None forbids writing.
+            port: Port to listen on; 0 picks a free one.
+            priority: Priority used for viewers' parameter writes, 0 (the highest) to 31; None forbids writing.
 
         Raises:
             UsageError: Two drones have the same name, or other machines would be able to write parameters.
-            LinkError: The address can't be listened on.
+            LinkError: Listening on the address failed.
             MissingExtraError: The extra ``[foxglove]`` is not installed.
         """
         check_names(drones, "view")
@@ -65,21 +65,21 @@ class FoxgloveServer:
             Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
             for drone in drones
         ]
-        self._lock = threading.Lock()  # guards the next three attributes, which viewers' threads change
-        self._viewers: Counter[str] = Counter()  # number of viewers by topic
-        self._began: set[str] = set()  # topics with a new subscription
-        self._starts: set[str] = set()  # topics with their first subscription
+        self._lock = threading.Lock()  # guards the next three attributes, which are modified on viewers' threads
+        self._viewers: Counter[str] = Counter()  # number of viewers per topic
+        self._began: set[str] = set()  # topics with a new subscriber
+        self._starts: set[str] = set()  # topics with their first subscriber
         self._known: dict[str, tuple[ViewTopic, tuple[Source, ...]]] = {}
         for number, drone in enumerate(drones):
             for topic in topics(drone.name, drone.capabilities, far=Known(drone).is_far):
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
-        self._chains: dict[str, Chain] = {}  # H.264 sent to viewers, by topic
-        self._ready = threading.Event()  # set once self._server exists: viewers may connect before
+        self._chains: dict[str, Chain] = {}  # H.264 sent to viewers so far, by topic
+        self._ready = threading.Event()  # set once self._server exists: viewers may connect earlier
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
         self._parameters = ParameterAccess(drones, priority, self._parameter_changed)
-        self._guard: OriginGuard | None = None  # before a server that writes parameters: any web page could connect
+        self._guard: OriginGuard | None = None  # used if parameters can be written: else any web page could connect
         hidden = hidden_host()
         try:
             if priority is not None:
@@ -97,8 +97,8 @@ class FoxgloveServer:
             if self._guard is not None:
                 self._guard.close()
             raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
-        # The SDK would log to Python while holding its own locks, which deadlocks: another thread may wait for such a
-        # lock while it holds the interpreter's.
+        # The SDK would log to Python while holding its own locks and deadlock: another thread may be waiting for one of
+        # these locks while it holds the GIL.
         self._sdk._foxglove_py.disable_logging()
         self.host = host
         self.port: int = self._server.port
@@ -114,14 +114,14 @@ class FoxgloveServer:
 
     @property
     def viewers(self) -> dict[str, int]:
-        """Number of subscribed viewers by topic. Can be read from any thread."""
+        """Number of subscribed viewers per topic. Safe to read from any thread."""
         with self._lock:
             return {topic: count for topic, count in self._viewers.items() if count > 0}
 
     # On the view's thread --------------------------------------------------------------------------------------
 
     def wanted(self) -> frozenset[Source]:
-        """Return the sources of the topics that viewers have subscribed to."""
+        """Return the sources needed for the topics that viewers have subscribed to."""
         with self._lock:
             found = {source for topic, count in self._viewers.items() if count > 0 for source in self._known[topic][1]}
             began, self._began = self._began, set()
@@ -133,7 +133,7 @@ class FoxgloveServer:
         return frozenset(found)
 
     def show(self, item: Item) -> None:
-        """Send a sample's messages to the subscribed viewers."""
+        """Send a sample's messages to the viewers subscribed to them."""
         for message in self._translators[item.drone].messages(item):
             if isinstance(item.sample, Picture) and not self._decodable(message, item.sample):
                 continue
@@ -149,14 +149,14 @@ class FoxgloveServer:
             channel.close()
 
     def _show_known(self, began: set[str]) -> None:
-        """Send new subscribers the known state: parameters, mountings, calibrations."""
+        """Send new subscribers what is already known: parameters, mountings, calibrations."""
         for translator in self._translators:
             for message in translator.prelude(monotonic_ns()):
                 if message.topic in began:
                     self._send(message)
 
     def _decodable(self, message: Message, picture: Picture) -> bool:
-        """Return whether viewers can decode a message after those already sent, starting with a key frame."""
+        """Return whether viewers can decode a message, given those already sent; a key frame must come first."""
         record = picture.record
         if record.format != H264 or message.kind is not CompressedVideo:
             return True
@@ -185,7 +185,7 @@ class FoxgloveServer:
     # On the viewers' threads -----------------------------------------------------------------------------------
 
     def subscribed(self, topic: str) -> None:
-        """Note that a viewer has subscribed."""
+        """Register a viewer's subscription."""
         with self._lock:
             self._viewers[topic] += 1
             self._began.add(topic)
@@ -193,12 +193,12 @@ class FoxgloveServer:
                 self._starts.add(topic)
 
     def unsubscribed(self, topic: str) -> None:
-        """Note that a viewer has unsubscribed, or disconnected."""
+        """Remove the subscription of a viewer that unsubscribed or disconnected."""
         with self._lock:
             self._viewers[topic] -= 1
 
     def read_parameters(self, names: Sequence[str]) -> list[Any]:
-        """Return the parameters with these names, or all."""
+        """Return the named parameters, or all."""
         self._ready.wait()
         self._parameters.follow()
         try:
@@ -209,7 +209,7 @@ class FoxgloveServer:
         return [self._parameter(name, value) for name, value in found.items()]
 
     def write_parameters(self, wanted: Sequence[Any]) -> list[Any]:
-        """Write parameters and return their resulting values."""
+        """Write parameters and return the values they have afterwards."""
         self._ready.wait()
         found = []
         for each in wanted:
@@ -220,7 +220,7 @@ class FoxgloveServer:
         return found
 
     def follow_parameters(self) -> None:
-        """Report changes from now on."""
+        """Report parameter changes from now on."""
         self._ready.wait()
         self._parameters.follow()
 
@@ -241,7 +241,7 @@ class FoxgloveServer:
 
 
 class _Listener:
-    """The SDK's callbacks, on its threads. The SDK only logs their exceptions."""
+    """The SDK's callbacks, which it calls on its own threads. It only logs exceptions that they raise."""
 
     def __init__(self, server: FoxgloveServer) -> None:
         self._server = server
@@ -280,7 +280,7 @@ def _sdk() -> Any:
 # Topics ---------------------------------------------------------------------------------------------------------
 
 
-_OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # one topic per camera; only in files
+_OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # FRAMES has a topic per camera; DROPS is only written to files
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,18 +288,18 @@ class ViewTopic:
     """A topic that viewers can subscribe to."""
 
     name: str
-    kind: type[Any]  #: class of its messages, see :class:`skyloop.recording.output.Message`
-    channels: tuple[str, ...]  #: the drone's channels that it needs; empty for state known in advance
-    at_once: bool = True  #: whether it is announced before its first message
+    kind: type[Any]  #: class of the topic's messages, see :class:`skyloop.recording.output.Message`
+    channels: tuple[str, ...]  #: the drone's channels that the topic needs; empty for state known in advance
+    at_once: bool = True  #: whether the topic is announced before its first message
 
     @property
     def shared(self) -> bool:
-        """Whether all drones share it."""
+        """Whether all drones share the topic."""
         return self.name in (layout.TF, layout.LOG)
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
-    """Yield a drone's topics; frames of a ``far`` drone are encoded for the network."""
+    """Yield a drone's topics; the frames of a ``far`` drone are encoded for the network."""
     for channel, kind in layout.TYPES.items():
         if channel not in _OTHERS:
             yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))

@@ -1,7 +1,7 @@
 """The layout of a recording: topics, schemas and times, encoding and decoding. See docs/recording.md.
 
-Pure, and without the MCAP library. Skyloop's own samples are JSON objects, encoded by :func:`encode` and decoded by
-:func:`decode`; messages for viewers are in :mod:`skyloop.recording.foxglove`.
+Pure, and independent of the MCAP library. Skyloop's own samples are JSON objects, encoded by :func:`encode` and decoded
+by :func:`decode`; :mod:`skyloop.recording.foxglove` encodes the messages for viewers.
 """
 
 from __future__ import annotations
@@ -63,17 +63,17 @@ __all__ = [
 T = TypeVar("T")
 
 PROFILE: Final = "skyloop"  #: profile in the MCAP header
-VERSION: Final = 2  #: version of this layout; files of layout 1, with older names, are also read
+VERSION: Final = 2  #: version of this layout; files with layout 1, which uses older names, can also be read
 JSON: Final = "json"  #: message encoding of Skyloop's own samples
 JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of Skyloop's own samples
-PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers
+PROTOBUF: Final = "protobuf"  #: both message and schema encoding of messages for viewers
 
-# Names of the metadata records. All their values are texts; see :class:`ClockPair` and :class:`Start`.
+# Names of the metadata records. All their values are strings; see :class:`ClockPair` and :class:`Start`.
 META_CLOCK: Final = "skyloop.clock"
 META_RECORDING: Final = "skyloop.recording"
-META_END: Final = "skyloop.end"  #: missing in a file not closed
+META_END: Final = "skyloop.end"  #: absent if the file was not closed
 
-LOG: Final = "/log"  #: foxglove.Log of all drones: events and logged texts
+LOG: Final = "/log"  #: foxglove.Log for all drones: events and log text
 TF: Final = "/tf"  #: foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
 WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
 
@@ -85,16 +85,16 @@ _LAST_UNIX_NS: Final = 2**63 - 1  #: in the year 2262
 
 
 class ClockPair(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.clock``: the same moment on the recorder's two clocks.
+    """Metadata ``skyloop.clock``: one moment read on both of the recorder's clocks.
 
-    A message's ``log_time`` is its reception, ``publish_time`` its capture (sending, publishing), both as Unix time
-    [ns] by this pair. Times *within* Skyloop's samples stay on the proxy's monotonic clock.
+    A message's ``log_time`` is when it was received, ``publish_time`` when it was captured (sent, published). This pair
+    converts both to Unix time [ns]. Times *within* Skyloop's samples stay on the proxy's monotonic clock.
     """
 
     monotonic_ns: int
     unix_ns: int
     pid: int
-    boot: str = ""  #: boot id of the host: monotonic times of another boot can't be compared
+    boot: str = ""  #: boot id of the host: monotonic times from different boots can't be compared
 
     @classmethod
     def now(cls) -> ClockPair:
@@ -104,14 +104,14 @@ class ClockPair(msgspec.Struct, frozen=True):
         return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is its clock minus the recorder's.
+        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is that monotonic clock minus the recorder's.
 
-        The result is clamped to the range of a file, so that a sample with an absurd time breaks no file.
+        The result is clamped to the range that a file can hold, so that a sample with an absurd time can't corrupt it.
         """
         return min(max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns), _LAST_UNIX_NS)
 
     def monotonic(self, unix_ns: int, offset_ns: int = 0) -> int:
-        """Convert Unix time [ns] to a monotonic time; the inverse of :meth:`unix`."""
+        """Convert Unix time [ns] to monotonic time; the inverse of :meth:`unix`."""
         return unix_ns - self.unix_ns + self.monotonic_ns + offset_ns
 
 
@@ -119,16 +119,16 @@ class ClockPair(msgspec.Struct, frozen=True):
 
 
 class DroneRecord(msgspec.Struct, frozen=True):
-    """One drone of a recording, in metadata ``skyloop.recording``."""
+    """One drone in a recording, from metadata ``skyloop.recording``."""
 
     name: str
     uri: str = ""
     capabilities: dict[str, Any] = {}  #: :class:`Capabilities`, converted by :func:`to_plain`
-    clock_offset_ns: int = 0  #: the proxy's clock minus the recorder's, as of the start
+    clock_offset_ns: int = 0  #: the proxy's clock minus the recorder's, measured at the start
 
     @property
     def described(self) -> Capabilities:
-        """The drone's capabilities.
+        """Decode the drone's capabilities.
 
         Raises:
             FileFormatError: They can't be decoded.
@@ -137,28 +137,28 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.recording``, written first in each file."""
+    """Metadata ``skyloop.recording``, written at the beginning of each file."""
 
     layout: int
-    skyloop: str  #: version of Skyloop
+    skyloop: str  #: Skyloop's version
     drones: tuple[DroneRecord, ...]
-    started_unix_ns: int  #: start of the whole recording; the same in all its files
-    file: int = 1  #: number of this file within the recording, from 1
+    started_unix_ns: int  #: start of the whole recording; equal in all its files
+    file: int = 1  #: this file's number within the recording, starting at 1
     options: dict[str, Any] = {}  #: recorder options: channels, encoding, quality
 
 
 class End(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.end``, written last in a closed file. All counts are since the start of the recording."""
+    """Metadata ``skyloop.end``, written at the end of a closed file. Losses count from the start of the recording."""
 
     reason: str  #: ``closed``, or ``rotated`` if another file follows
     ended_unix_ns: int
-    written: dict[str, int]  #: messages in *this file*, by topic
+    written: dict[str, int]  #: number of messages in *this file*, by topic
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
     missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel, from gaps in their numbers
 
 
 def to_metadata(record: msgspec.Struct) -> dict[str, str]:
-    """Convert a metadata record to strings: strings unchanged, everything else as JSON."""
+    """Convert a metadata record to strings: strings stay as they are, everything else becomes JSON."""
     fields = msgspec.to_builtins(record)
     return {
         key: value if isinstance(value, str) else msgspec.json.encode(value).decode() for key, value in fields.items()
@@ -169,7 +169,7 @@ def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
     """Convert strings back to a metadata record.
 
     Raises:
-        FileFormatError: The strings do not fit the record.
+        FileFormatError: The strings do not match the record.
     """
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
@@ -204,27 +204,27 @@ class Channel(StrEnum):
 
 
 class FrameRecord(msgspec.Struct, frozen=True):
-    """A recorded frame; its image is a separate message with the same sequence and times.
+    """A recorded frame. Its image is a separate message with the same sequence number and times.
 
-    The image is on :func:`image_topic`, or for H.264 on :func:`video_topic`.
+    The image is on the topic given by :func:`image_topic` or, for H.264, by :func:`video_topic`.
     """
 
     header: FrameHeader  #: as received
     received_ns: int  #: on the recorder's monotonic clock
-    format: str  #: format of the image in the file: ``jpeg``, ``png``, ``h264``
-    key: bool = True  #: whether it can be decoded alone, as everything but some ``h264`` frames can
+    format: str  #: the image's format in the file: ``jpeg``, ``png``, ``h264``
+    key: bool = True  #: whether it can be decoded on its own; false only for some ``h264`` frames
 
 
 class ResultRecord(msgspec.Struct, frozen=True):
-    """A processor's result for a frame: a ``ProcessorResult`` with its value in JSON, NumPy's arrays as lists."""
+    """A processor's result for a frame: a ``ProcessorResult`` whose value is in JSON, with NumPy arrays as lists."""
 
     processor: str
     worker: int
     number: int
     camera: str
-    seq: int  #: sequence number of the frame
-    captured_ns: int  #: capture of the frame
-    made_ns: int  #: completion of the result, on the proxy's clock
+    seq: int  #: the frame's sequence number
+    captured_ns: int  #: when the frame was captured
+    made_ns: int  #: when the result was completed, on the proxy's clock
     took_ns: int
     value: Any = None
 
@@ -233,11 +233,11 @@ class Drops(msgspec.Struct, frozen=True):
     """Totals by channel (``feedback``, ``video.front``) since the start of the recording, written after each change."""
 
     at_ns: int  #: on the recorder's monotonic clock
-    dropped: dict[str, int]  #: received but dropped because the disk or the encoder was too slow
-    missed: dict[str, int]  #: never received: dropped by the proxy for a slow recorder, or lost in transport
+    dropped: dict[str, int]  #: received but dropped, because the disk or the encoder was too slow
+    missed: dict[str, int]  #: never received: dropped by the proxy because the recorder was slow, or lost in transport
 
 
-#: Types of the messages of Skyloop's own channels.
+#: Message types of Skyloop's own channels.
 TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
     Channel.FEEDBACK: Feedback,
     Channel.COMMANDS: Applied,
@@ -265,7 +265,7 @@ class Topic:
 
 
 def parse_topic(topic: str) -> Topic | None:
-    """Parse one of Skyloop's own topics; return None for any other."""
+    """Parse one of Skyloop's own topics; return None for any other topic."""
     parts = [_unquoted(part) for part in topic.split("/")]
     if len(parts) not in (3, 4) or parts[0] or parts[2] not in set(Channel):
         return None
@@ -291,7 +291,7 @@ def calibration_topic(drone: str, camera: str) -> str:
 
 
 def drawing_topic(drone: str, camera: str) -> str:
-    """Return the topic of the annotations on a camera's frames, foxglove.ImageAnnotations."""
+    """Return the topic of the annotations drawn on a camera's frames, foxglove.ImageAnnotations."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/annotations"
 
 
@@ -301,7 +301,7 @@ def pose_topic(drone: str) -> str:
 
 
 def mocap_topic(drone: str) -> str:
-    """Return the topic of the drone's pose by motion capture, foxglove.PoseInFrame."""
+    """Return the topic of the drone's pose from motion capture, foxglove.PoseInFrame."""
     return f"/{_quoted(drone)}/mocap"
 
 
@@ -311,7 +311,7 @@ def path_topic(drone: str) -> str:
 
 
 def optical_frame(drone: str, camera: str) -> str:
-    """Return the name of a camera's frame of reference: x right, y down, z forward."""
+    """Return the name of a camera's coordinate frame: x right, y down, z forward."""
     return f"{drone}/{camera}"
 
 

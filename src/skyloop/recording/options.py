@@ -1,4 +1,4 @@
-"""Recording options, checked before anything is opened; the next file's name; the status of a recorder."""
+"""Recording options, validated before anything is opened; the name of the next file; the status of a recorder."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ VideoEncoding = Literal["auto", "jpeg", "png"]
 
 MB: Final = 1_000_000
 VIDEO: Final = "video"
-#: Channels to choose from; ``video.CAMERA`` is one camera.
+#: Channels to choose from; ``video.CAMERA`` selects one camera.
 CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, Channel.DROPS)), VIDEO)
 
 
 class Options(msgspec.Struct, frozen=True):
-    """Recording options; see :func:`skyloop.record` for each.
+    """Recording options; :func:`skyloop.record` describes each.
 
     Raises:
         UsageError: A value is out of range.
@@ -59,19 +59,19 @@ class Options(msgspec.Struct, frozen=True):
         return self.rotate_mb is not None or self.rotate_s is not None
 
     def wants(self, channel: Channel) -> bool:
-        """Whether a channel without a camera is recorded."""
+        """Return whether a channel that has no camera is recorded."""
         return channel.value in self.channels
 
     def wants_camera(self, camera: str) -> bool:
-        """Whether a camera's frames are recorded."""
+        """Return whether a camera's frames are recorded."""
         return VIDEO in self.channels or f"{VIDEO}.{camera}" in self.channels
 
     def keeps_stream(self, camera: CameraInfo) -> bool:
-        """Whether a camera's frames are recorded as the vehicle encodes them."""
+        """Return whether a camera's frames are recorded in the vehicle's own encoding."""
         return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
-        """Check the chosen cameras.
+        """Check that the chosen cameras exist.
 
         Raises:
             UnknownNameError: No drone has a camera of that name.
@@ -84,14 +84,14 @@ class Options(msgspec.Struct, frozen=True):
 
 
 def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Convert the caller's choice of channels to names of :data:`CHOICES`.
+    """Convert the caller's choice of channels to names from :data:`CHOICES`.
 
     Args:
-        names: One or several; ``command`` means ``commands``. None chooses all.
+        names: One name or several; ``command`` means ``commands``. None selects all.
 
     Raises:
-        UnknownNameError: There is no such channel.
-        UsageError: No channel is named.
+        UnknownNameError: A channel does not exist.
+        UsageError: No channel was given.
     """
     if names is None:
         return CHOICES
@@ -112,12 +112,12 @@ def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """Return the file with this number of a recording: ``flight-0002.mcap``."""
+    """Return the path of a recording's file with this number, such as ``flight-0002.mcap``."""
     return path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to: the given file (``.mcap`` by default), or one in a folder named by drones and time.
+    """Return the path to record to: the file (``.mcap`` by default), or in a folder, one named by drones and time.
 
     Raises:
         UsageError: The file already exists, or its folder does not.
@@ -142,20 +142,20 @@ class RecorderState(StrEnum):
 
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  #: the disk can't be written; essential samples wait, and writing is retried each second
-    CLOSED = "closed"  #: closed on purpose; the file is complete
-    FAILED = "failed"  #: its process was killed, or an error ended its thread; data already written is in the file
+    PAUSED = "paused"  #: the disk can't be written to; essential samples wait, and writing is retried each second
+    CLOSED = "closed"  #: closed intentionally; the file is complete
+    FAILED = "failed"  #: its process was killed, or an error ended its thread; the data written so far are in the file
 
 
 class Status(msgspec.Struct, frozen=True):
-    """The status of a recording at one time."""
+    """The status of a recording at one moment."""
 
     state: RecorderState = RecorderState.STARTING
-    reason: str = ""  #: why it is paused, has failed or leaves frames out
-    path: str = ""  #: the current or last file
+    reason: str = ""  #: why it is paused, has failed or is leaving frames out
+    path: str = ""  #: the current file, or the last one
     files: tuple[str, ...] = ()  #: all files, oldest first
     seconds: float = 0.0  #: time since the start
-    bytes: int = 0  #: in all files
+    bytes: int = 0  #: in all files together
     messages: int = 0
     waiting: int = 0  #: bytes received but not written yet
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
@@ -163,27 +163,27 @@ class Status(msgspec.Struct, frozen=True):
 
 
 class RecorderEvent(msgspec.Struct, frozen=True):
-    """An event of a recording, for people and applications."""
+    """An event of a recording, for users and applications."""
 
     text: str
     severity: Severity = Severity.INFO
 
 
 class Room(StrEnum):
-    """Samples still written as the disk fills up."""
+    """What is still written as the disk fills up."""
 
     ALL = "all"
     NO_FRAMES = "no frames"
     NOTHING = "nothing"
 
 
-_MARGIN: Final = 1.25  #: factor above a limit that must be free before more is written again
+_MARGIN: Final = 1.25  #: free space required before writing more again, as a multiple of the limit
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:
     """Decide what to write: everything above the floor, no frames below it, nothing below a quarter of it.
 
-    Writing more than ``before`` again needs a margin above the limit.
+    To write more than ``before``, the free space must exceed the limit by a margin.
     """
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:

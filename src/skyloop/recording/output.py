@@ -1,4 +1,4 @@
-"""One MCAP file of a recording. Committed data stays readable in any event."""
+"""One MCAP file of a recording. Committed data stay readable whatever happens later."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from skyloop.recording.options import MB
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
 
-CHUNK: Final = MB  #: bytes after which a chunk is closed, unless :meth:`RecordingFile.commit` does so before
+CHUNK: Final = MB  #: a chunk is closed after this many bytes, or earlier by :meth:`RecordingFile.commit`
 
 
 class Target(Protocol):
-    """An unbuffered file open for writing."""
+    """An unbuffered file that is open for writing."""
 
     def write(self, data: Any, /) -> int | None: ...
     def truncate(self, size: int | None = None, /) -> int: ...
@@ -35,17 +35,17 @@ Opener = Callable[[Path, bool], Target]
 
 
 def open_target(path: Path, overwrite: bool) -> Target:
-    """Open a file without a buffer.
+    """Open a file for unbuffered writing.
 
     Raises:
-        OSError: The file exists, or can't be written.
+        OSError: The file already exists, or can't be written.
     """
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message of the file. ``kind`` is the class of a Skyloop sample, or a protobuf class."""
+    """A message for the file. ``kind`` is the class of a Skyloop sample, or a protobuf class."""
 
     topic: str
     kind: type[msgspec.Struct | Protobuf]
@@ -57,16 +57,16 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The description of a kind of messages for programs that do not know it."""
+    """Describes a kind of message to programs that do not know it."""
 
     name: str
-    encoding: str  #: encoding of the description
+    encoding: str  #: encoding of the schema itself
     data: bytes
     message_encoding: str
 
     @classmethod
     def of(cls, kind: type[Any]) -> Schema:
-        """Return the schema of a :class:`Message`'s kind."""
+        """Return the schema for a :class:`Message`'s kind."""
         if issubclass(kind, msgspec.Struct):
             return cls(layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind), layout.JSON)
         from skyloop.recording import foxglove
@@ -75,29 +75,29 @@ class Schema:
 
 
 class Output:
-    """The MCAP writer's stream: nothing reaches the file before :meth:`flush`, then everything or nothing."""
+    """The MCAP writer's stream. Nothing reaches the file until :meth:`flush`, which writes everything or nothing."""
 
     def __init__(self, target: Target) -> None:
-        self.committed = 0  #: bytes in the file, up to the end of a record
-        self.waiting = 0  #: bytes not in the file yet
+        self.committed = 0  #: bytes in the file, always ending at a record boundary
+        self.waiting = 0  #: bytes not yet in the file
         self._target = target
         self._pieces: list[bytes] = []
 
     def write(self, data: bytes) -> int:
-        """Append to the waiting data; return the number of bytes."""
+        """Append to the waiting data and return the number of bytes."""
         self._pieces.append(data)
         self.waiting += len(data)
         return len(data)
 
     def tell(self) -> int:
-        """Return the size of the file including waiting data [bytes]."""
+        """Return the size of the file, including waiting data [bytes]."""
         return self.committed + self.waiting
 
     def flush(self) -> None:
         """Write the waiting data to the file.
 
         Raises:
-            OSError: The disk fails; the file then keeps its previous end.
+            OSError: The disk fails; the file still ends where it did before.
         """
         try:
             for piece in self._pieces:
@@ -115,20 +115,20 @@ class Output:
 
 
 class RecordingFile:
-    """An MCAP file being written; messages are in the file after :meth:`commit`.
+    """An MCAP file being written; :meth:`commit` makes the messages part of the file.
 
-    Every method raises ``OSError`` when the disk fails; after that, call only :meth:`abandon`.
+    Every method raises ``OSError`` if the disk fails; after that, only :meth:`abandon` may be called.
 
     Attributes:
         path: The file.
         written: Number of messages by topic.
-        count: Number of all messages.
+        count: Total number of messages.
     """
 
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
-        """Create the file and write its metadata; ``clock`` relates monotonic and Unix time.
+        """Create the file and write its metadata. ``clock`` relates monotonic to Unix time.
 
         Raises:
             OSError: The file can't be created or written.
@@ -140,7 +140,7 @@ class RecordingFile:
             raise MissingExtraError("recording", "record", cause=str(error)) from None
         self.path = path
         self.written: Counter[str] = Counter()
-        self.count = 0  #: number of all messages
+        self.count = 0  #: total number of messages
         self._target = opener(path, overwrite)
         self._output = Output(self._target)
         self._writer = Writer(cast(IO[Any], self._output), chunk_size=CHUNK, compression=CompressionType.LZ4)
@@ -157,12 +157,12 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Bytes, including waiting ones."""
+        """Size in bytes, including waiting data."""
         return self._output.tell()
 
     @property
     def lost(self) -> bool:
-        """Whether the file was deleted. A moved file is still written."""
+        """Whether the file was deleted. A file that was only moved is still written to."""
         try:
             return os.fstat(self._target.fileno()).st_nlink == 0
         except OSError:
@@ -178,7 +178,7 @@ class RecordingFile:
         self.count += 1
 
     def commit(self) -> None:
-        """Close the chunk and write everything to the file."""
+        """Close the chunk and write all waiting data to the file."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def close(self, end: End) -> None:
@@ -192,7 +192,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Close the file as it is: readable up to the last commit, without a summary. Remove an empty file."""
+        """Close the file as it is, readable up to the last commit but without a summary. Remove it if it is empty."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)

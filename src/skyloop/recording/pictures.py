@@ -1,7 +1,7 @@
-"""A recorded frame and its pixels: JPEG, PNG, or H.264, whose frames depend on one another and are decoded on demand.
+"""A recorded frame and its pixels: JPEG, PNG, or H.264, whose frames depend on each other and are decoded on demand.
 
-The image is the field ``data`` of a foxglove.CompressedImage or, if the vehicle's H.264 was kept, of a
-foxglove.CompressedVideo, extracted from its Protocol Buffers encoding
+The image is in the field ``data`` of a foxglove.CompressedImage or, if the vehicle's H.264 was kept, of a
+foxglove.CompressedVideo. It is extracted from the Protocol Buffers encoding
 (https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image,
 …/compressed-video).
 """
@@ -23,22 +23,22 @@ from skyloop.recording.layout import FrameRecord
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-_DATA: Final = 2  #: field number of the compressed image
-_VIDEO_DATA: Final = 3  #: field number of H.264
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: wire types of fields
+_DATA: Final = 2  #: field number of ``data`` in CompressedImage
+_VIDEO_DATA: Final = 3  #: field number of ``data`` in CompressedVideo
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: wire types of Protocol Buffers fields
 _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A frame of a recording."""
+    """A frame of a recording, with its image."""
 
     camera: str
     record: FrameRecord
-    log_ns: int  #: time of reception, Unix time [ns]
-    publish_ns: int  #: time of capture, Unix time [ns]
+    log_ns: int  #: when it was received, Unix time [ns]
+    publish_ns: int  #: when it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: for H.264 that can be decoded: its group, and its index in it
+    group: tuple[Group, int] | None = None  #: for decodable H.264: the frame's group and its index in it
 
     @property
     def header(self) -> FrameHeader:
@@ -47,7 +47,7 @@ class Picture:
 
     @property
     def compressed(self) -> bytes:
-        """The image file, or access unit, in ``record.format``.
+        """The image file or access unit, in ``record.format``.
 
         Raises:
             FileFormatError: The message is damaged.
@@ -56,11 +56,11 @@ class Picture:
 
     @property
     def can_be_decoded(self) -> bool:
-        """Whether the images that it depends on are known: false for H.264 without its key frame."""
+        """Whether all frames that it depends on are known; false for H.264 whose key frame is missing."""
         return self.record.format != H264 or self.group is not None
 
     def pixels(self) -> NDArray[np.uint8]:
-        """Decode the frame: BGR, shape (height, width, 3), uint8.
+        """Decode the frame to BGR, shape (height, width, 3), uint8.
 
         Raises:
             FileFormatError: The frame can't be decoded.
@@ -69,7 +69,7 @@ class Picture:
         return self._decoded(grey=False)
 
     def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
-        """Decode the frame in the vehicle's encoding if that was raw, else as BGR.
+        """Decode the frame to the vehicle's own encoding if that was raw, otherwise to BGR.
 
         Raises:
             FileFormatError: The frame can't be decoded.
@@ -92,7 +92,7 @@ class Picture:
 
 
 def compressed(message: bytes, record: FrameRecord) -> bytes:
-    """Extract an image file, or access unit, from its message.
+    """Extract an image file or access unit from its message.
 
     Raises:
         FileFormatError: The message is damaged.
@@ -101,7 +101,7 @@ def compressed(message: bytes, record: FrameRecord) -> bytes:
 
 
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
-    """Decode JPEG or PNG to BGR, shape (height, width, 3), or grey (height, width), uint8.
+    """Decode JPEG or PNG to BGR, shape (height, width, 3), or greyscale, shape (height, width); uint8.
 
     Raises:
         FileFormatError: The data can't be decoded.
@@ -124,7 +124,7 @@ def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
 
 
 def _field(message: bytes, number: int) -> bytes:
-    """Return a bytes field of an encoded message; empty if missing."""
+    """Return a bytes field of an encoded message; empty if the field is missing."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
@@ -144,7 +144,7 @@ def _field(message: bytes, number: int) -> bytes:
 
 
 def _varint(message: bytes, at: int) -> tuple[int, int]:
-    """Decode a varint (seven bits per byte); return it and its end."""
+    """Decode a varint (seven bits per byte); return it and the index after it."""
     number = shift = 0
     while at < len(message) and shift < 64:
         byte = message[at]
@@ -160,13 +160,13 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
 
 
 class Group:
-    """A key frame and its followers, in order of capture. Decoding continues where it last stopped."""
+    """A key frame and the frames that depend on it, in order of capture. Decoding resumes where it last stopped."""
 
     def __init__(self) -> None:
         self._units: list[bytes] = []
         self._context: VideoCodecContext | None = None
-        self._done = 0  # units decoded so far
-        self._image: Any = None  # image of the last of them
+        self._done = 0  # number of units decoded so far
+        self._image: Any = None  # image of the last one decoded
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -185,7 +185,7 @@ class Group:
         """
         if self._context is None or index < self._done - 1:
             self._context, self._done = _decoder(), 0
-        while self._done <= index and (self._done == 0 or self._image is not None):  # after damage all fail
+        while self._done <= index and (self._done == 0 or self._image is not None):  # damage ends the group
             self._image = _decode(self._context, self._units[self._done])
             self._done += 1
         if self._image is None:
@@ -194,7 +194,7 @@ class Group:
 
 
 class Groups:
-    """Sorts the frames of one camera, in order, into groups."""
+    """Sorts one camera's frames, passed in order, into groups."""
 
     def __init__(self) -> None:
         self._chain = Chain()
@@ -204,7 +204,7 @@ class Groups:
         """Add a frame.
 
         Returns:
-            The group and the index in it; None for a frame that can't be decoded because an earlier one is missing.
+            The group and the frame's index in it; None if the frame can't be decoded because an earlier one is missing.
         """
         if not self._chain.follows(number, key=key):
             return None

@@ -1,7 +1,7 @@
-"""Skyloop's own samples as JSON objects with a schema, and back; and their times. Pure, without the MCAP library.
+"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, no MCAP library.
 
-The keys are the fields of a sample's class. Unknown values are absent; numbers that are not finite are null; an extra
-key (``action``, ``shape``) distinguishes the members of a union.
+The keys are the field names of the sample's class. Unknown values are absent, numbers that are not finite are null, and
+an extra key (``action``, ``shape``) distinguishes the members of a union.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from skyloop.messages import (
 
 T = TypeVar("T")
 
-MAX_DEPTH: Final = 64  #: nesting of lists and objects in a sample; a processor's results have a handful
+MAX_DEPTH: Final = 64  #: maximum nesting of lists and objects in a sample; processors' results use a handful of levels
 MIN_INT: Final = -(1 << 63)
 MAX_INT: Final = (1 << 63) - 1
 
@@ -46,13 +46,13 @@ def decode(data: bytes | memoryview, kind: type[T]) -> T:
     """Decode a sample from JSON.
 
     Raises:
-        FileFormatError: The data are not a sample of that kind.
+        FileFormatError: The data do not describe a sample of that type.
     """
     return from_plain(from_json(data), kind)
 
 
 def from_json(data: bytes | memoryview | str) -> Any:
-    """Decode any JSON.
+    """Decode arbitrary JSON.
 
     Raises:
         FileFormatError: The data are not JSON, or nested too deeply.
@@ -63,7 +63,7 @@ def from_json(data: bytes | memoryview | str) -> Any:
         raise FileFormatError(f"a message is not JSON: {error}") from None
 
 
-#: How the members of a union are distinguished in JSON: key and value.
+#: The key and value that identify each member of a union in JSON.
 _TAGS: Final[dict[type, tuple[str, str]]] = {
     **{action: ("action", name) for action, name in ACTION_NAMES.items()},
     Polyline: ("shape", "polyline"),
@@ -72,7 +72,7 @@ _TAGS: Final[dict[type, tuple[str, str]]] = {
 }
 
 
-#: Field names in recordings of layout 1, by current name.
+#: Field names in recordings with layout 1, by current name.
 _FORMER: Final[dict[type, dict[str, str]]] = {
     Feedback: {
         "roll_rad": "roll",
@@ -89,7 +89,7 @@ _FORMER: Final[dict[type, dict[str, str]]] = {
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a sample to dict, list, str, numbers and bool."""
+    """Convert a sample to dicts, lists, strings, numbers and booleans."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, msgspec.Struct):
@@ -113,7 +113,7 @@ def from_plain(plain: Any, kind: type[T]) -> T:
     """Convert plain values back to a sample.
 
     Raises:
-        FileFormatError: The values are not a sample of that kind.
+        FileFormatError: The values do not describe a sample of that type.
     """
     restore = _restorer(kind)  # type: ignore[arg-type]
     try:
@@ -123,11 +123,11 @@ def from_plain(plain: Any, kind: type[T]) -> T:
 
 
 def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
-    """Return a JSON value unchanged if other programs can read it, nested at most ``depth`` deep.
+    """Return a JSON value unchanged if other programs can read it and it is nested at most ``depth`` levels deep.
 
     Raises:
-        ValueError: A whole number has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
-            nested too deeply.
+        ValueError: An integer has more than 64 bits, which neither NumPy nor a packet can hold, or the value is nested
+            too deeply.
     """
     if isinstance(value, dict | list):
         if depth <= 0:
@@ -144,7 +144,7 @@ _Restore = Callable[[Any], Any]
 
 @cache
 def _restorer(kind: Any) -> _Restore:
-    """Return a function that prepares a JSON value for ``msgspec.convert`` to this type."""
+    """Return a function that prepares a JSON value for conversion to this type by ``msgspec.convert``."""
     return _restore_type(inspect.type_info(kind))
 
 
@@ -219,7 +219,7 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
             return structs[value[key]][1](value)
         if only is not None:
             restored = only(value)
-            # A vector with an unknown part is unknown; our own samples hold only finite numbers.
+            # A vector with an unknown component is unknown as a whole; our own samples hold only finite numbers.
             unknown = nothing is None and isinstance(restored, list) and any(one != one for one in restored)
             return None if unknown else restored
         return (
@@ -233,16 +233,16 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
 
 
 def schema_name(kind: type[msgspec.Struct]) -> str:
-    """Return the name of a sample's schema."""
+    """Return the schema name of a sample."""
     return f"skyloop.{kind.__name__}"
 
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """Return the JSON schema of a sample, in the subset that viewers understand: no references and no unions.
+    """Return a sample's JSON schema, limited to what viewers understand: no references and no unions.
 
-    (Foxglove's and Lichtblick's readers want "type": "object" at the root and one type for each property and item.) A
-    property with several possible types, such as a parameter's value, is therefore not listed: others are allowed.
+    (Foxglove and Lichtblick require "type": "object" at the root and one type for each property and item.) A property
+    with several possible types, such as a parameter's value, is therefore not listed; the schema allows unlisted ones.
     The description is the first line of the class's docstring.
     """
     info = inspect.type_info(kind)
@@ -260,7 +260,7 @@ _SIMPLE: Final = (
 
 
 def _schema_of(info: inspect.Type) -> dict[str, Any]:
-    """Return the schema of a type; empty if it can't be described."""
+    """Return a type's schema; empty if it can't be described."""
     if isinstance(info, inspect.Metadata):
         return _schema_of(info.type)
     for kind, name in _SIMPLE:
@@ -284,13 +284,13 @@ def _schema_of(info: inspect.Type) -> dict[str, Any]:
 
 
 def _array(items: dict[str, Any]) -> dict[str, Any]:
-    if items.get("type") == "array":  # viewers can't show arrays of arrays; points appear as drawings instead
+    if items.get("type") == "array":  # viewers can't display arrays of arrays; points are shown as drawings instead
         return {}
     return {"type": "array", "items": items} if items else {}
 
 
 def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
-    """Return one object with the properties of all structs."""
+    """Return one object schema with the properties of all structs."""
     properties: dict[str, Any] = {}
     for struct in structs:
         if struct.cls in _TAGS:
@@ -304,19 +304,19 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 
 # Times ----------------------------------------------------------------------------------------------------------
 #
-# A sample's time is when the proxy knew it, on the proxy's own clock: the time axis of a flight. The file's times are
-# the recorder's; in a recording of a replay in step with its application they are unrelated to the flight.
+# A sample's timestamp is when the proxy received it, on the proxy's clock: the time axis of a flight. The file's
+# own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: ignore a sample's time that is more than this before the newest
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this ahead of it
+_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is more than this before the newest one
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this after the newest one
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")
 
 
 def reported_ns(value: Any) -> int | None:
-    """Return the time when the proxy received or published a sample; None if it has none."""
+    """Return when the proxy received or published a sample; None if the sample has no time."""
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
     if isinstance(value, Applied):
@@ -333,7 +333,7 @@ def reported_ns(value: Any) -> int | None:
 
 
 def shifted(value: Any, shift_ns: int) -> Any:
-    """Return a sample with its times moved ahead by ``shift_ns``."""
+    """Return a copy of a sample with its times shifted forward by ``shift_ns``."""
     names = [name for name in _TIMES if getattr(value, name, 0)]
     if names:
         return msgspec.structs.replace(value, **{name: getattr(value, name) + shift_ns for name in names})
@@ -344,27 +344,27 @@ def shifted(value: Any, shift_ns: int) -> Any:
 
 
 class Course:
-    """The time along a recording, sample by sample: it never runs backwards, and ignores a single wrong time.
+    """Tracks the time along a recording, sample by sample: it never runs backwards and ignores a single wrong time.
 
-    When the proxy's clock restarts because its computer rebooted, time continues from the last value, advanced by as
-    much as the recorder's clock.
+    If the proxy's clock restarts because its computer rebooted, time continues from the last value, advanced by the
+    time elapsed on the recorder's clock.
 
     Attributes:
         first_ns: Time of the first sample that has one.
         newest_ns: Time of the newest sample.
-        shift_ns: Current offset added to the samples' own times, after restarts of the proxy's clock.
+        shift_ns: Offset currently added to the samples' own times, to compensate for restarts of the proxy's clock.
     """
 
     def __init__(self, shift_ns: int = 0) -> None:
-        """Start before the first sample, with a known shift if there is one."""
+        """Start before the first sample, with a known shift if given."""
         self.first_ns: int | None = None
         self.newest_ns = 0
         self.shift_ns = shift_ns
-        self._doubted_ns: int | None = None  # an implausible time: accepted if the next one agrees
+        self._doubted_ns: int | None = None  # an implausible time, accepted if the next one agrees with it
         self._log_ns = 0  # log time of the newest sample
 
     def follow(self, value: Any, log_ns: int = 0) -> int:
-        """Return the time of the next sample in the order of the file, recorded at ``log_ns`` (0: unknown)."""
+        """Return the time of the next sample in file order, recorded at ``log_ns`` (0: unknown)."""
         own_ns = reported_ns(value)
         if own_ns is None:
             return self.newest_ns
@@ -374,7 +374,7 @@ class Course:
         elif -_BACK_NS < own_ns - self.newest_ns < _AHEAD_NS:
             self.newest_ns = max(self.newest_ns, own_ns)
             self._doubted_ns = None if isinstance(value, Feedback) else self._doubted_ns
-        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # other samples' times may come from applications
+        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # applications may set other samples' times
             agree = self._doubted_ns is not None and abs(own_ns - self._doubted_ns) < _BACK_NS
             self._doubted_ns = own_ns
             if agree and own_ns < self.newest_ns:

@@ -1,4 +1,4 @@
-"""Read a recording: its drones, and their samples in order of reception; and describe a folder of them."""
+"""Read a recording: its drones, and their samples in order of reception; describe the files in a folder."""
 
 from __future__ import annotations
 
@@ -51,53 +51,53 @@ from skyloop.recording.scan import (
     scan,
 )
 
-#: Called with the share of a file read so far, 0 to 1.
+#: Called with the fraction of a file read so far, 0 to 1.
 Progress = Callable[[float], object]
 ENDING: Final = ".mcap"
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One message of the file; times are Unix time [ns]."""
+    """One message in the file; times are Unix time [ns]."""
 
     topic: str
-    log_ns: int  #: time of reception
-    publish_ns: int  #: time of capture
+    log_ns: int  #: when it was received
+    publish_ns: int  #: when it was captured
     sequence: int
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One sample of a drone. ``value`` has the channel's type in ``skyloop.recording.layout.TYPES``."""
+    """One sample of a drone. ``value`` has the channel's type from ``skyloop.recording.layout.TYPES``."""
 
     channel: Channel
-    camera: str  #: camera of a frame; else empty
+    camera: str  #: the camera for a frame; otherwise empty
     entry: Entry
     value: Any
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A channel of the file."""
+    """A channel in the file."""
 
     topic: str
     schema: str
-    own: Topic | None  #: None for viewers' and foreign topics
+    own: Topic | None  #: None for viewers' topics and for those of other programs
 
 
 @dataclass(slots=True)
 class Recording:
-    """An MCAP file recorded by Skyloop. Opening reads its index or, without one, scans it; each iteration reads it.
+    """An MCAP file recorded by Skyloop. Opening it reads the index or, if there is none, scans the file.
 
-    A truncated file is read up to its end, and ``cut`` says where it ends. Unreadable parts in the middle are skipped,
-    and ``damaged`` says where.
+    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is.
+    Unreadable parts in the middle are skipped, and ``damaged`` lists them.
     """
 
     path: Path
     start: Start
     clock: ClockPair
-    end: End | None  #: None for a file not closed
+    end: End | None  #: None if the file was not closed
     found: Scan
     _bad: Counter[str] = field(default_factory=Counter)
     _complete: bool = False  # whether all channels are known
@@ -130,7 +130,7 @@ class Recording:
 
     @property
     def cut(self) -> str:
-        """Why the file is incomplete, in words; empty for a complete one."""
+        """Why the file is incomplete, in words; empty if it is complete."""
         return self.found.cut
 
     @property
@@ -144,11 +144,11 @@ class Recording:
         return self.start.drones
 
     def drone(self, name: str | None = None) -> DroneRecord:
-        """Return the drone of that name, or the first.
+        """Return the drone with this name, or the first one if no name is given.
 
         Raises:
             UnknownNameError: The recording has no such drone.
-            FileFormatError: The recording has no drone at all.
+            FileFormatError: The recording has no drones.
         """
         if not self.drones:
             raise FileFormatError(f"{self.path} has no drone")
@@ -179,7 +179,7 @@ class Recording:
         )
 
     def cameras(self, drone: str) -> list[str]:
-        """Return the cameras with frames, in the vehicle's order.
+        """Return the cameras that have frames, in the vehicle's order.
 
         Raises:
             UnknownNameError: The recording has no such drone.
@@ -191,7 +191,7 @@ class Recording:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """Log time of the first and the last message, Unix time [ns]; zeros if there is none."""
+        """Log times of the first and last messages, Unix time [ns]; zeros if there are none."""
         times = [(piece.start_ns, piece.end_ns) for piece in self.found.pieces if piece.end_ns]
         if not times:
             return 0, 0
@@ -213,7 +213,7 @@ class Recording:
         Args:
             topics: Topics to yield; None yields all.
             from_ns: Log time to start from, Unix time [ns].
-            progress: Called with the share read so far, 0 to 1.
+            progress: Called with the fraction read so far, 0 to 1.
 
         Raises:
             UsageError: The file can no longer be read.
@@ -222,7 +222,7 @@ class Recording:
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with open_file(self.path) as file:
-            # Several threads feed a recorder: a message can precede a slightly older one, even in the next piece.
+            # Several threads feed a recorder: a slightly older message can come later, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
@@ -243,13 +243,13 @@ class Recording:
         from_ns: int = 0,
         progress: Progress | None = None,
     ) -> Iterator[Item]:
-        """Yield Skyloop's own samples of a drone. Skip undecodable ones and count them in :attr:`damaged`.
+        """Yield Skyloop's own samples of a drone. Skip undecodable samples and note them in :attr:`damaged`.
 
         Args:
             drone: The drone's name.
             channels: Channels to yield.
             from_ns: Log time to start from, Unix time [ns].
-            progress: Called with the share read so far, 0 to 1.
+            progress: Called with the fraction read so far, 0 to 1.
         """
         topics = self._topics(drone, channels)
         for entry in self.entries(topics, from_ns=from_ns, progress=progress):
@@ -266,12 +266,12 @@ class Recording:
         *,
         from_ns: int = 0,
     ) -> Iterator[Item | Picture]:
-        """Yield samples like :meth:`items`, with each frame as a :class:`Picture`: its record with its image.
+        """Yield samples like :meth:`items`, but combine each frame's record and image into a :class:`Picture`.
 
         Args:
             drone: The drone's name.
             channels: Channels to yield.
-            progress: Called with the share read so far, 0 to 1.
+            progress: Called with the fraction read so far, 0 to 1.
             from_ns: Log time to start from, Unix time [ns].
         """
         images = _image_topics(drone, self.cameras(drone))
@@ -291,7 +291,7 @@ class Recording:
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
-        """Decode a message of one of Skyloop's own channels; None, counted in :attr:`damaged`, if that fails."""
+        """Decode a message from one of Skyloop's own channels; if damaged, note it in :attr:`damaged`, return None."""
         try:
             return decode(entry.data, TYPES[channel])
         except FileFormatError as error:
@@ -301,7 +301,7 @@ class Recording:
     # Internals -------------------------------------------------------------------------------------------------
 
     def _piece(self, file: IO[bytes], piece: Piece, wanted: Collection[str] | None) -> Iterator[Entry]:
-        """Yield the messages of a part of the file, in the file's order."""
+        """Yield the messages in a part of the file, in file order."""
         channels = self.found.channels
         for record in records(file, piece, self.found.damage):
             if not isinstance(record, Message):
@@ -316,7 +316,7 @@ class Recording:
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
     ) -> Iterator[Item | Picture]:
-        """Yield samples of some topics, with frames as pictures instead of records."""
+        """Yield the samples of some topics, with frames as pictures instead of records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
             topic = topics.get(entry.topic)
@@ -341,7 +341,7 @@ class Recording:
         }
 
 
-_Kind = tuple[str, bool]  # camera, and whether it is the vehicle's own H.264
+_Kind = tuple[str, bool]  # camera, and whether the image is the vehicle's own H.264
 
 
 def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
@@ -350,13 +350,13 @@ def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
 
 
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
-    """Return the topics with images."""
+    """Return the topics that hold images."""
     found: dict[str, _Kind] = {image_topic(drone, camera): (camera, False) for camera in cameras}
     return found | {video_topic(drone, camera): (camera, True) for camera in cameras}
 
 
 class _Pairs:
-    """Pairs each frame's record with its image by their sequence number, in either order."""
+    """Pairs each frame's record with its image by sequence number; either may come first."""
 
     def __init__(self) -> None:
         self._records: dict[_Kind, tuple[Entry, FrameRecord]] = {}
@@ -381,7 +381,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # decoding a picture without a group raises
+            with suppress(FileFormatError):  # decoding a picture that has no group raises
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 
@@ -395,12 +395,12 @@ def _foreign(found: Scan) -> str:
 
 
 class Described(msgspec.Struct, frozen=True):
-    """The description of a recording."""
+    """A summary of a recording."""
 
     started: float | None = None  #: Unix time [s]; None if unknown
     drones: tuple[str, ...] = ()
     seconds: float | None = None  #: from the first message to the last
-    problem: str = ""  #: why it is unreadable or incomplete; empty for a complete file
+    problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
 
 
 def shown_name(path: Path) -> str:
@@ -409,7 +409,7 @@ def shown_name(path: Path) -> str:
 
 
 def describe(path: Path) -> Described:
-    """Describe a file without unpacking anything. The file's content never makes it raise."""
+    """Describe a file without decompressing anything. The file's content never causes an exception."""
     try:
         recording = Recording.open(path)
         return Described(

@@ -1,4 +1,4 @@
-"""``skyloop.record``: a recorder for connected drones, or for drones given by name."""
+"""Implement ``skyloop.record``: a recorder for connected drones, or for drones given by name."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from skyloop.recording.options import (
 
 
 class Recorder:
-    """A recording that runs until :meth:`close` or the end of its ``with`` block. Can be used from any thread."""
+    """A recording that runs until :meth:`close` or the end of its ``with`` block. Safe to use from any thread."""
 
     def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
-        """Start the recording; applications call :func:`record`.
+        """Start the recording. Applications call :func:`record` instead.
 
         Raises:
-            UsageError: The drones have the same name, or the file can't be written.
-            LinkError: A drone can't be connected to, or the recorder's process ended.
+            UsageError: Two drones have the same name, or the file can't be written.
+            LinkError: Connecting to a drone failed, or the recorder's process ended.
             NoAnswerError: The recorder's process does not start.
         """
         self._listening = [drone for drone in drones if isinstance(drone, Drone)]
@@ -71,7 +71,7 @@ class Recorder:
 
     @property
     def status(self) -> Status:
-        """The current status; some of its parts also have their own properties."""
+        """The current status; some of its fields are also available as properties."""
         return self._backend.status
 
     @property
@@ -86,7 +86,7 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """The current or last file."""
+        """The current file, or the last one."""
         return Path(self.status.path)
 
     @property
@@ -101,7 +101,7 @@ class Recorder:
 
     @property
     def bytes(self) -> int:
-        """Bytes written so far, in all files."""
+        """Bytes written so far to all files."""
         return self.status.bytes
 
     @property
@@ -153,29 +153,29 @@ def record(
     overwrite: bool = False,
     in_process: bool | None = None,
 ) -> Recorder:
-    """Record one or several drones to an MCAP file; return once the recording runs. Use as a context manager.
+    """Record one or several drones to an MCAP file; return once the recording is running. Use as a context manager.
 
     Args:
         drones: Connected drones, or names of running proxies.
-        path: A file, or a folder in which to choose a file name.
+        path: A file, or a folder in which a file name is chosen.
         channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
-            ``video`` and ``video.CAMERA``; None records all.
+            ``video`` and ``video.CAMERA``; None records everything.
         encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
-            ``"auto"`` keeps the vehicle's H.264 if it sends that, and otherwise encodes as JPEG.
+            ``"auto"`` keeps the vehicle's H.264 if it sends any, and otherwise encodes as JPEG.
         quality: JPEG quality, 1 to 100 (best).
-        rotate_mb: Start a new file after this many megabytes (``flight-0001.mcap``, …), each self-contained, H.264 at a
-            key frame; None does not.
-        rotate_s: The same after this many seconds.
-        min_free_mb: Free space to leave on the disk: below it no frames are recorded, below a quarter of it nothing.
-        buffer_mb: Amount of data that can wait for a slow disk before frames are dropped.
+        rotate_mb: Start a new file (``flight-0001.mcap``, …) after this many megabytes, H.264 at the next key frame.
+            Each file is self-contained. None never does.
+        rotate_s: Start a new file after this many seconds; None never does.
+        min_free_mb: Free space to leave on the disk. No frames are recorded below this, nothing below a quarter of it.
+        buffer_mb: Amount of data held for a slow disk before frames are dropped.
         overwrite: Whether to replace an existing file.
-        in_process: Whether to record on threads of this process instead of in a separate one; None does so only if a
-            drone can't be reached from another process.
+        in_process: Whether to record on threads of this process instead of in a separate one; None uses threads only if
+            a drone can't be reached from another process.
 
     Raises:
-        UsageError: An argument is wrong, or the file already exists or can't be written.
-        UnknownNameError: There is no such channel or camera.
-        LinkError: A drone can't be connected to, or the recorder's process can't record.
+        UsageError: An argument is invalid, or the file already exists or can't be written.
+        UnknownNameError: A channel or camera does not exist.
+        LinkError: Connecting to a drone failed, or the recorder's process can't record.
         NoAnswerError: The recorder's process does not start.
         MissingExtraError: The extra ``[record]`` is not installed.
     """
@@ -204,16 +204,16 @@ def record(
 # The recorder's process -----------------------------------------------------------------------------------------
 
 
-START_S: Final = 20.0  #: time for the child to start recording
-_END_S: Final = 15.0  # time to write received samples before the child is terminated
-_HARDER_S: Final = 3.0  # after terminating the child, before killing it
-_TELL_S: Final = 0.25  # period of the child's status reports
-_NICE: Final = 5  # the flight has priority
+START_S: Final = 20.0  #: time allowed for the child to start recording
+_END_S: Final = 15.0  # time allowed to write received samples before the child is terminated
+_HARDER_S: Final = 3.0  # time from terminating the child to killing it
+_TELL_S: Final = 0.25  # interval between the child's status reports
+_NICE: Final = 5  # niceness of the child: the flight has priority
 _log = logging.getLogger(__name__)
 
 
 class Order(msgspec.Struct, frozen=True):
-    """The parameters of a recording child."""
+    """The parameters passed to a recording child."""
 
     targets: tuple[str, ...]  #: address or name of each drone
     path: str
@@ -221,12 +221,12 @@ class Order(msgspec.Struct, frozen=True):
 
 
 class Line(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A child's message to its parent: one JSON object per line."""
+    """A message from a child to its parent: one JSON object per line."""
 
     status: Status | None = None
     event: RecorderEvent | None = None
     trouble: str = ""  #: why the child could not start
-    usage: bool = False  #: whether that is a UsageError
+    usage: bool = False  #: whether that trouble is a UsageError
 
 
 # The child -----------------------------------------------------------------------------------------------------
@@ -239,7 +239,7 @@ def run_child(order: Order) -> int:
     on_parent_end(stop.set)
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    # This thread sends them, so that a parent that does not read never blocks the writing thread.
+    # Sent on this thread, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:
         try:
@@ -274,13 +274,13 @@ def _print(line: Line) -> None:
 
 
 class RecorderProcess:
-    """A recording child process; it ends with :meth:`stop`, and with this process, however that ends."""
+    """A child process that records. It ends on :meth:`stop`, or when this process ends for any reason."""
 
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
-        """Start the child and wait until it records; ``on_event`` is called on the thread that reads its events.
+        """Start the child and wait until it records. ``on_event`` is called on the thread that reads its events.
 
         Raises:
-            UsageError: The child can't record because of a wrong argument.
+            UsageError: The child can't record because an argument is invalid.
             LinkError: The child can't record for another reason, or has ended.
             NoAnswerError: The child does not start in time.
         """
@@ -309,7 +309,7 @@ class RecorderProcess:
         return self._status
 
     def stop(self) -> None:
-        """Have the child write all received samples and close its file; wait for its end. Idempotent.
+        """Have the child write all received samples and close its file, then wait for it to end. Idempotent.
 
         A child that does not end in time is terminated, then killed.
         """
@@ -357,7 +357,7 @@ class RecorderProcess:
 
 
 def check_installed() -> None:
-    """Check that the extra is installed, to raise the error here rather than in a child.
+    """Check that the extra is installed, so that the error is raised here rather than in a child.
 
     Raises:
         MissingExtraError: The extra ``[record]`` is not installed.

@@ -1,4 +1,4 @@
-"""Drones in Rerun: their samples as Rerun entities, on the timeline ``capture`` (Unix time).
+"""Convert drones' samples to Rerun entities, on the timeline ``capture`` (Unix time).
 
 =============================== =====================================================================
 ``world/drones/NAME``           pose and axes
@@ -46,8 +46,8 @@ from skyloop.recording.translation import Path as Trail
 
 TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
-_MOST_SERIES: Final = 64  # limit of series and drawing sources, because applications choose their names
-_PATH_EVERY_NS: Final = 1_000_000_000  # between points of a path
+_MOST_SERIES: Final = 64  # maximum number of series and of drawing sources, because applications choose their names
+_PATH_EVERY_NS: Final = 1_000_000_000  # interval between points of a path
 _FRUSTUM_M: Final = 0.3  # drawn size of a camera
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _STATE: Final[dict[str, tuple[str, ...]]] = {
@@ -60,29 +60,29 @@ _STATE: Final[dict[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A drone whose samples are shown."""
+    """A drone to show."""
 
     name: str
     capabilities: Capabilities
-    unix: Callable[[int], int]  #: converts a time on its proxy's clock to Unix time [ns]
+    unix: Callable[[int], int]  #: converts a time on the drone's proxy's clock to Unix time [ns]
 
 
 class RerunLog:
-    """A Rerun recording. Use it from one thread only."""
+    """A Rerun recording. Must be used from a single thread."""
 
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
-        """Initialise a recording without a destination: call :meth:`save` or :meth:`connect` next.
+        """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
         Args:
-            drones: Drones whose samples are added.
-            recording: Name of the recording; Rerun merges recordings with equal names. Empty: a unique one.
+            drones: Drones whose samples will be added.
+            recording: Name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
 
         Raises:
             MissingExtraError: The extra ``[rerun]`` is not installed.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
-        self._stream.set_log_time_enabled(False)  # log time is the time of writing, meaningless for a recording
+        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which means nothing in a recording
         self._stream.set_log_tick_enabled(False)
         self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
         self._shown = drones
@@ -112,15 +112,15 @@ class RerunLog:
         self._begin()
 
     def add(self, drone: int, sample: Any) -> None:
-        """Add a sample of the drone with this index, if its kind is drawn."""
+        """Add a sample of the drone with this index, if samples of its type are drawn."""
         self._drones[drone].add(sample)
 
     def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
-        """Add a frame: its image file, or H.264 access unit; the first must be a key frame."""
+        """Add a frame as an image file or H.264 access unit; the first H.264 frame must be a key frame."""
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:
-        """Return whether the viewer or disk accepts everything added within this time, above 0 [s]."""
+        """Return whether the viewer or disk accepts all added samples within this time [s], which must be positive."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
@@ -128,15 +128,15 @@ class RerunLog:
         return True
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Finish the file, or send the rest, waiting up to ``timeout_s`` [s] for the viewer.
+        """Finish the file, or send the remaining data to the viewer, waiting up to ``timeout_s`` [s].
 
         Raises:
-            LinkError: The viewer does not accept the rest, which is dropped.
+            LinkError: The viewer did not accept the remaining data, which are dropped.
         """
         if self.taken(timeout_s):
             self._stream.disconnect()
             return
-        # Disconnecting, now or when Python exits, would wait for the viewer forever.
+        # Disconnecting, now or when Python exits, could wait for the viewer forever.
         threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
         self._rr.unregister_shutdown()
         raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs, or is closed")
@@ -202,7 +202,7 @@ class _Drone:
         }
 
     def begin(self) -> None:
-        """Draw the fixed parts: axes and mountings."""
+        """Draw the static parts: axes and mountings."""
         rr = self._rr
         self._stream.log(f"world/drones/{self._name}", rr.TransformAxes3D(0.3), static=True)
         for camera in self._cameras.values():
@@ -339,12 +339,12 @@ class _Drone:
 
 
 def entity_of(drone: str, camera: CameraInfo) -> str:
-    """Return the entity of a camera: in the world if its mounting is known."""
+    """Return a camera's entity, which is in the world if its mounting is known."""
     return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
 
 
 def part(name: str) -> str:
-    """Quote a name as a part of an entity path."""
+    """Quote a name for use as a part of an entity path."""
     return str(rerun_sdk().escape_entity_path_part(name))
 
 
@@ -362,7 +362,7 @@ def rerun_sdk() -> Any:
 
 
 def _within(known: set[Any], name: Any) -> bool:
-    """Return whether an application's name may have an entity; their number is limited."""
+    """Return whether an application's name gets an entity; their number is limited."""
     if name not in known and len(known) < _MOST_SERIES:
         known.add(name)
     return name in known

@@ -1,4 +1,4 @@
-"""Rerun as a screen: a viewer, started or already running, or a file; and export of a recording to such a file."""
+"""Show drones in Rerun, in a viewer that is started or already running, or in a file; export a recording to a file."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from skyloop.recording.translation import Picture
 from skyloop.recording.view import Source
 
 PORT: Final = 9876  #: default port of Rerun's viewer
-_START_S: Final = 20.0  # time for the viewer to listen
-_AHEAD: Final = 8 * MB  #: bytes that the viewer can be behind
-_PATIENCE_S: Final = 0.5  # how long to wait for a slow viewer before dropping samples
-_ASK_NS: Final = nanoseconds(1.0)  # how often to check whether the viewer keeps up
-_LAST_S: Final = 5.0  # time for the viewer to accept the rest at the end
-_LOOK_S: Final = 0.1  # how often to check whether the viewer listens
-_SETTLED_S: Final = 1.0  # how long it must listen to count as started
+_START_S: Final = 20.0  # time allowed for the viewer to start listening
+_AHEAD: Final = 8 * MB  #: bytes that the viewer may lag behind
+_PATIENCE_S: Final = 0.5  # time to wait for a slow viewer before dropping samples
+_ASK_NS: Final = nanoseconds(1.0)  # interval between checks that the viewer keeps up
+_LAST_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
+_LOOK_S: Final = 0.1  # interval between checks that the viewer listens
+_SETTLED_S: Final = 1.0  # time the viewer must keep listening to count as started
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
 
 
 class RerunViewer:
-    """A :class:`skyloop.recording.view.Screen` of everything: Rerun does not report what is on display."""
+    """A :class:`skyloop.recording.view.Screen` that shows everything: Rerun does not report what is displayed."""
 
     def __init__(
         self,
@@ -53,19 +53,19 @@ class RerunViewer:
         connect: str | None = None,
         save: Path | None = None,
     ) -> None:
-        """Start or connect to the viewer, or open the file.
+        """Start the viewer or connect to it, or open the file.
 
         Args:
-            drones: Connected drones, with different names.
-            host: Address on which a started viewer listens.
-            port: Port of the viewer; a viewer already listening there is used. None: 9876; 0: any free one.
-            connect: Address of a running viewer to use instead.
-            save: File to write instead.
+            drones: Connected drones, with distinct names.
+            host: Address on which a viewer started here listens.
+            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
+            connect: Address of a running viewer to use instead of starting one.
+            save: File to write instead of using a viewer.
 
         Raises:
             UsageError: Two drones have the same name, the file can't be written, or the address is invalid.
             LinkError: The viewer can't be started.
-            NoAnswerError: The viewer does not listen in time.
+            NoAnswerError: The viewer does not start listening in time.
             MissingExtraError: The extra ``[rerun]`` is not installed.
         """
         check_names(drones, "view")
@@ -98,7 +98,7 @@ class RerunViewer:
         return self._channels
 
     def show(self, item: Item) -> None:
-        """Draw a sample, unless the viewer hangs: Rerun would queue everything in memory."""
+        """Draw a sample, unless the viewer hangs: Rerun would queue all of them in memory."""
         if not self._keeps_up(item):
             self.left_out += 1
             return
@@ -109,7 +109,7 @@ class RerunViewer:
             self._shown.add_picture(item.drone, sample.record, sample.data)
 
     def close(self) -> None:
-        """Finish the file; the viewer stays open."""
+        """Finish the file. The viewer stays open."""
         try:
             self._shown.close(_PATIENCE_S if self._stalled else _LAST_S)
         except SkyloopError as error:
@@ -143,14 +143,14 @@ def _start(host: str, port: int) -> None:
     """Start a viewer that outlives this program, unless one is already listening."""
     if _listens(host, port):
         return
-    # Rerun's own spawn() would listen on all addresses.
+    # Rerun's own spawn() would listen on all network interfaces.
     command = [sys.executable, "-m", "rerun_cli", "--bind", host, "--port", str(port), "--expect-data-soon"]
     try:
         viewer = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL)
     except OSError as error:
         raise LinkError(f"Rerun's viewer can't be started: {error}") from None
     end = time.monotonic() + _START_S
-    listening_s = 0.0  # a viewer without a display listens for a moment before it exits
+    listening_s = 0.0  # a viewer without a display listens for a moment, then exits
     while listening_s < _SETTLED_S:
         if viewer.poll() is not None:
             raise LinkError(
@@ -158,7 +158,7 @@ def _start(host: str, port: int) -> None:
                 "show the drones in a viewer elsewhere with --connect URL"
             )
         if time.monotonic() > end:
-            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the started process
+            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the process started here
             raise NoAnswerError(f"Rerun's viewer is not listening on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
         listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
@@ -204,18 +204,18 @@ class Exported:
 def export_rrd(
     recording: Recording, path: Path, *, drone: str | None = None, progress: Progress | None = None
 ) -> Exported:
-    """Write a recording for Rerun.
+    """Export a recording to a file for Rerun.
 
     Args:
         recording: The recording.
-        path: The file; an existing one is replaced.
+        path: The file to write; an existing one is replaced.
         drone: The drone to export; None exports all.
-        progress: Called with the share read so far, 0 to 1.
+        progress: Called with the fraction read so far, 0 to 1.
 
     Raises:
         UnknownNameError: The recording has no such drone.
         UsageError: The file can't be written.
-        FileFormatError: The recording has no drone.
+        FileFormatError: The recording has no drones.
         MissingExtraError: The extra ``[rerun]`` is not installed.
     """
     chosen = [recording.drone(drone)] if drone is not None or not recording.drones else list(recording.drones)

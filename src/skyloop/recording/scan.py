@@ -1,7 +1,8 @@
-"""The structure of an MCAP file, from its index or, for a truncated file, without it; and reading its parts.
+"""Find the structure of an MCAP file from its index, or by a scan if it is truncated; and read its parts.
 
-The format is https://mcap.dev/spec: records of an opcode, a length and that many bytes, most of them chunks, which hold
-messages. Reading stops at a record that the end of the file cuts off; of a truncated chunk, the existing part is read.
+The format is described at https://mcap.dev/spec: each record has an opcode, a length and that many bytes. Most are
+chunks, which hold messages. Reading stops at a record that is cut off by the end of the file; if that is a chunk, the
+part of it that exists is read.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 #: Bytes of a chunk, packed and unpacked, and of a message outside chunks. Recorders close a chunk after 1 to 4 MB; only
 #: its last message makes it larger, and the largest is an uncompressed 4K image.
 MAX_CHUNK: Final = 64 << 20
-#: Greatest ratio of a chunk's unpacked size. LZ4 reaches at most 255, and nearly constant data 150.
+#: Maximum compression ratio of a chunk. LZ4 reaches at most 255, and nearly constant data 150.
 MAX_RATIO: Final = 512
-MAX_RECORD: Final = 8 << 20  #: bytes of a metadata record, a schema or a channel; Skyloop's take some kilobytes
-#: Bytes of a file's metadata, schemas and channels, which stay in memory. A recording of 100 drones has about 1 MB.
+MAX_RECORD: Final = 8 << 20  #: bytes in a metadata record, a schema or a channel; Skyloop's have a few kilobytes
+#: Bytes of metadata, schemas and channels, which are kept in memory. A recording of 100 drones has about 1 MB.
 MAX_HEAD: Final = 32 << 20
-MAX_PIECES: Final = 500_000  #: chunks of a file; a recorder that closes one per second gets there after five days
-MAX_RECORDS: Final = 5_000_000  #: records of a file outside chunks, of which Skyloop's recordings have some hundreds
+MAX_PIECES: Final = 500_000  #: chunks in a file; a recorder that closes one per second gets there after five days
+MAX_RECORDS: Final = 5_000_000  #: records outside chunks; Skyloop's recordings have a few hundred
 MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
-_RUN: Final = 4 << 20  #: bytes of messages outside chunks read at once
+_RUN: Final = 4 << 20  #: bytes of messages outside chunks to read at once
 
 try:
     from mcap.data_stream import ReadDataStream
@@ -41,13 +42,13 @@ except ImportError as error:
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
-#: Of a chunk: first and last time, size and CRC when unpacked, length of compression's name.
+#: Head of a chunk: first and last time, uncompressed size and CRC, length of the compression's name.
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
-_LONGEST: Final = 1 << 32  #: a longer record counts as damage
-MAX_NAME: Final = 16  #: bytes of a compression's name
+_LONGEST: Final = 1 << 32  #: a record longer than this counts as damage
+MAX_NAME: Final = 16  #: maximum length of a compression's name [bytes]
 
-#: Exceptions that reading a damaged record can raise.
+#: Exceptions that reading a damaged record may raise.
 Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError, RecursionError)
 
 Record = Schema | Channel | Message
@@ -77,13 +78,13 @@ __all__ = [
 class Piece:
     """A chunk, or a run of messages outside chunks."""
 
-    offset: int  #: offset of the chunk's data, or of the run's first record
+    offset: int  #: offset of the chunk's data, or of the first record in the run
     size: int  #: in the file
-    start_ns: int = 0  #: log time of its first and last message; 0 if unknown
+    start_ns: int = 0  #: log times of its first and last messages; 0 if unknown
     end_ns: int = 0
-    compression: str | None = None  #: compression of a chunk, ``""`` for none; None: a run of messages
-    crc: int | None = 0  #: 0: none; None: not yet read from the chunk's head
-    unpacked: int = 0  #: announced bytes of a chunk's records
+    compression: str | None = None  #: a chunk's compression, ``""`` if it is not compressed; None for a run of messages
+    crc: int | None = 0  #: 0 if there is none; None if it has not yet been read from the chunk's head
+    unpacked: int = 0  #: uncompressed size of a chunk's records, as announced
     cut: bool = False  #: whether the file ends within it
 
 
@@ -97,13 +98,13 @@ class Scan:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each
-    cut: str = ""  #: why the file is incomplete, in words; empty for a file with index and end
+    attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
+    cut: str = ""  #: why the file is incomplete, in words; empty for a file with an index and an end
     damaged: list[str] = field(default_factory=list)  #: unreadable parts, in words
-    head: int = 0  #: bytes of metadata, schemas and channels kept
+    head: int = 0  #: bytes of metadata, schemas and channels kept in memory
 
     def damage(self, what: str) -> None:
-        """Add a description of an unreadable part, once."""
+        """Add a description of an unreadable part, unless it is already listed."""
         if what not in self.damaged:
             self.damaged.append(what)
 
@@ -124,7 +125,7 @@ def scan(path: str | Path) -> Scan:
 
 
 def find_channels(found: Scan) -> None:
-    """Read all of a truncated file to find its channels: only a complete file repeats them at the end."""
+    """Read all of a truncated file to find its channels: only complete files repeat them at the end."""
     with open_file(found.path) as file:
         for piece in found.pieces:
             for record in records(file, piece, found.damage):
@@ -132,7 +133,7 @@ def find_channels(found: Scan) -> None:
 
 
 def attachments(found: Scan) -> Iterator[Attachment]:
-    """Yield the attachments; skip unreadable ones and note them as damage."""
+    """Yield the attachments. Skip unreadable ones and list them as damage."""
     with open_file(found.path) as file:
         for offset, length in found.attachments:
             file.seek(offset)
@@ -146,7 +147,7 @@ def open_file(path: Path) -> IO[bytes]:
     """Open a file for reading.
 
     Raises:
-        UsageError: The file can't be read; the message has the reason.
+        UsageError: The file can't be read; the message gives the reason.
     """
     try:
         return path.open("rb")
@@ -155,7 +156,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def note(found: Scan, record: Record) -> None:
-    """Store a schema or channel, unless there are already too many."""
+    """Store a schema or channel, unless there are too many already."""
     if isinstance(record, Channel):
         if record.id in found.channels or has_room(found, len(record.topic) + len(str(record.metadata))):
             found.channels[record.id] = record
@@ -164,7 +165,7 @@ def note(found: Scan, record: Record) -> None:
 
 
 def has_room(found: Scan, size: int) -> bool:
-    """Return whether ``size`` more bytes can be kept in memory; note damage if not."""
+    """Return whether ``size`` more bytes can be kept in memory; if not, list that as damage."""
     found.head += size
     if found.head > MAX_HEAD:
         found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels: the others are left out")
@@ -172,7 +173,7 @@ def has_room(found: Scan, size: int) -> bool:
 
 
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Yield schemas, channels and messages of a piece, in the file's order; ``damaged`` gets what can't be read."""
+    """Yield the schemas, channels and messages of a piece in file order; add what can't be read to ``damaged``."""
     try:
         if piece.size > MAX_CHUNK:
             raise ValueError(f"a part of {piece.size} bytes, but at most {MAX_CHUNK} are read at once")
@@ -180,7 +181,7 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
             piece = _with_crc(file, piece)
         file.seek(piece.offset)
         data = file.read(piece.size)
-        most = len(data)  # most records: each takes at least a byte unpacked
+        most = len(data)  # maximum number of records: each takes at least one uncompressed byte
         if piece.compression is not None:
             data = _unpack(piece, data)
         yield from _parse(data, most)
@@ -190,15 +191,15 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
 
 
 def chunk_head_size(compression: str) -> int:
-    """Return the number of bytes before the data in a chunk's record."""
+    """Return the number of bytes that precede the data in a chunk's record."""
     return FRAME.size + CHUNK_HEAD.size + len(compression) + 8
 
 
 def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
-    """Read the checksum of a chunk known from the index.
+    """Read the checksum of a chunk that is known only from the index.
 
     Raises:
-        ValueError: There is no such chunk.
+        ValueError: There is no chunk at that place.
     """
     size = chunk_head_size(piece.compression or "")
     file.seek(piece.offset - size)
@@ -226,7 +227,7 @@ class _Scanner:
         self._found = found
         self._file = file
         self._offset = len(MAGIC)
-        self._run_start: int | None = None  # start of messages outside chunks
+        self._run_start: int | None = None  # start of a run of messages outside chunks
 
     def run(self) -> None:
         found, file = self._found, self._file
@@ -311,9 +312,9 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """Return a chunk's records, or the existing part of a truncated chunk if its compression allows that.
+    """Decompress a chunk's records, or the existing part of a truncated chunk if its compression allows that.
 
-    Unpack no more than the chunk announces, and nothing if it announces too much.
+    Decompress no more than the chunk announces, and nothing if it announces too much.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
@@ -348,7 +349,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
 
 
 def _parse(data: bytes, most: int) -> Iterator[Record]:
-    """Yield records up to the end of the data; skip one that is cut off there.
+    """Yield records up to the end of the data, skipping one that is cut off there.
 
     Raises:
         ValueError: There are more than ``most`` records.
@@ -377,22 +378,22 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
 
 # By the index ---------------------------------------------------------------------------------------------------
 #
-# Without reading the records before it. The index is trusted only if it accounts for every byte of the file: then it
-# agrees with scan(). The footer gives the place and checksum of the summary, which gives each chunk's place, size and
-# times.
+# Opens a file without reading all its records. The index is trusted only if it accounts for every byte of the file, in
+# which case it agrees with scan(). The footer holds the offset and checksum of the summary, which lists each chunk's
+# offset, size and times.
 
 
-_FOOTER: Final = struct.Struct("<QQI")  #: start of the summary and of its offsets, checksum
+_FOOTER: Final = struct.Struct("<QQI")  #: offset of the summary, offset of its offset section, checksum
 _TAIL: Final = FRAME.size + _FOOTER.size + len(MAGIC)
 _DATA_END: Final = FRAME.size + 4
-_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes of the following map
-_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, packed and unpacked
+_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes in the map that follows
+_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, compressed and uncompressed
 _U64: Final = struct.Struct("<Q")
 _U32: Final = struct.Struct("<I")
 
 
 def indexed(path: str | Path) -> Scan | None:
-    """Return the structure of a file by its index; None if it has no reliable one.
+    """Return the structure of a file from its index, or None if it has no reliable one.
 
     Raises:
         UsageError: The file does not exist or can't be read.
@@ -414,7 +415,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     if not begin or summary is None:
         return False
     data, end = summary
-    spans: list[tuple[int, int]] = []  # parts between the header and the end of the data: offset and end
+    spans: list[tuple[int, int]] = []  # offset and end of each part between the header and the end of the data
     metadata: list[MetadataIndex] = []
     for opcode, body in _records(data):
         if opcode == Opcode.CHUNK_INDEX:
@@ -439,11 +440,11 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # with too much content, the order decides which parts are skipped: use a scan
+    return not found.damaged  # with too much content, what gets skipped depends on the order, so a scan is needed
 
 
 def _header_end(file: IO[bytes]) -> int:
-    """Return the end of the file's first record; 0 if it is not a header."""
+    """Return the end of the file's first record, or 0 if that is not a header."""
     head = file.read(len(MAGIC) + FRAME.size)
     if len(head) < len(MAGIC) + FRAME.size or not head.startswith(MAGIC):
         return 0
@@ -452,7 +453,7 @@ def _header_end(file: IO[bytes]) -> int:
 
 
 def _summary(found: Scan, file: IO[bytes]) -> tuple[bytes, int] | None:
-    """Return the summary section and the end of the data before it; None if missing or damaged."""
+    """Return the summary section and where the data before it end; None if it is missing or damaged."""
     at = found.size - _TAIL
     if at < 0:
         return None
@@ -484,7 +485,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
-    """Return a chunk, and its place including the indexes of its messages."""
+    """Return a chunk and its extent in the file, including its message indexes."""
     start_ns, end_ns, offset, length, map_size = _INDEX_HEAD.unpack_from(body)
     at = _INDEX_HEAD.size + map_size
     (indexes,) = _U64.unpack_from(body, at)
@@ -501,7 +502,7 @@ def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
 
 
 def _is_gapless(spans: list[tuple[int, int]], begin: int, end: int) -> bool:
-    """Return whether spans cover the range between two offsets without gaps."""
+    """Return whether spans cover the range between two offsets without any gap."""
     for start, stop in spans:
         if start != begin or stop < start:
             return False

@@ -1,4 +1,4 @@
-"""Subscriptions to one drone: samples go from the receiving thread to the backlog, frames through an encoder."""
+"""Subscribe to one drone: samples go from the receiving thread to the backlog, frames through an encoder."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # plus one being encoded and one arriving: a client can't hold more frame slots
-_SIZE: Final = 400  #: bytes of an ordinary sample, approximately
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # without a stream frame for this long, record decoded frames
-_PARAMETERS_S: Final = 2.0  # pause before retrying to read parameters
+_FRAMES_WAITING: Final = 2  # in addition to one being encoded and one arriving: a client can't hold more frame slots
+_SIZE: Final = 400  #: approximate size of an ordinary sample [bytes]
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # if no frame of the stream arrives for this long, record decoded frames
+_PARAMETERS_S: Final = 2.0  # pause before trying again to read parameters
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
 
 
 def check_names(drones: Sequence[Drone], of: str) -> None:
-    """Check that the drones of a recording or view have different names.
+    """Check that the drones in a recording or view have distinct names.
 
     Raises:
         UsageError: Two drones have the same name.
@@ -59,14 +59,14 @@ def check_names(drones: Sequence[Drone], of: str) -> None:
 
 
 class Gaps:
-    """Counts missing numbers in a rising sequence. A number that is not higher starts a new sequence."""
+    """Counts the numbers missing from an increasing sequence. A number that is not higher starts a new sequence."""
 
     def __init__(self) -> None:
         self.missed = 0
         self._last: int | None = None
 
     def restart(self) -> None:
-        """Start a new sequence: numbers missing up to the next one were not wanted."""
+        """Start a new sequence: any gap before the next number is intentional, not a loss."""
         self._last = None
 
     def follow(self, number: int) -> None:
@@ -78,12 +78,12 @@ class Gaps:
 
 
 class Tap:
-    """Subscribes to one drone and puts its samples into the backlog."""
+    """Subscribes to one drone and adds its samples to the backlog."""
 
     def __init__(
         self, number: int, drone: Drone, options: Options, backlog: Backlog, *, encoded_far: bool = False
     ) -> None:
-        """Initialise without subscribing; ``encoded_far``: over a network the proxy encodes raw frames as H.264."""
+        """Initialise without subscribing. With ``encoded_far``, the proxy encodes raw frames as H.264 for a network."""
         self.drone = drone
         self._number = number
         self._options = options
@@ -118,7 +118,7 @@ class Tap:
             video.start()
 
     def stop(self) -> None:
-        """Unsubscribe; on return, everything received is in the backlog."""
+        """Unsubscribe. When this returns, everything received is in the backlog."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
@@ -143,22 +143,22 @@ class Tap:
         return {channel: missed for channel, missed in found.items() if missed}
 
     def check_streams(self) -> None:
-        """Check each second whether the vehicle's own encoding still arrives."""
+        """Check each second whether the vehicle's own encoding is still arriving."""
         for video in self._videos:
             video.check_stream(time.monotonic_ns())
 
     def put_drops(self, dropped: dict[str, int], missed: dict[str, int]) -> None:
-        """Put the counts of dropped and missed samples into the backlog."""
+        """Add the counts of dropped and missed samples to the backlog."""
         now_ns = time.monotonic_ns()
         self._put("drops", Rank.KEPT, Drops(now_ns, dropped, missed), _SIZE, now_ns)
 
     def put_event(self, text: str, severity: Severity, data: dict[str, str]) -> None:
-        """Put an event of the recorder into the backlog."""
+        """Add one of the recorder's own events to the backlog."""
         event = Event(EventKind.RECORDING, text, self.drone.now_ns, severity, app="recorder", data=dict(data))
         self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
     def put_parameter(self, parameter: Parameter) -> None:
-        """Put a parameter into the backlog."""
+        """Add a parameter to the backlog."""
         self._put(Channel.PARAMETERS.value, Rank.KEPT, parameter, _SIZE)
 
     # On the receiving thread -----------------------------------------------------------------------------------
@@ -174,7 +174,7 @@ class Tap:
     def _event(self, event: Event) -> None:
         if event.seq:  # the client's own events have no number
             self._gaps["events"].follow(event.seq)
-        if event.kind is not EventKind.RECORDING:  # put_event adds the recorder's own
+        if event.kind is not EventKind.RECORDING:  # put_event adds the recorder's own events
             self._put("events", Rank.KEPT, event, _SIZE)
 
     def _applied(self, applied: Applied) -> None:
@@ -191,12 +191,12 @@ class Tap:
 
 
 class Stream:
-    """One camera's frames as encoded by the vehicle, or for a subscriber, from the first key frame on."""
+    """One camera's frames as encoded by the vehicle, or for a subscriber, starting at the first key frame."""
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, subscriber: str = "") -> None:
         self.gaps = Gaps()
         self.dropped = 0  #: frames that can't be decoded because an earlier one is missing
-        self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
+        self.newest_ns = 0  #: arrival time of the newest decodable frame, or the time of the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
         self._topic = stream_channel(drone, camera, subscriber=subscriber)
@@ -230,9 +230,9 @@ class Stream:
 
 
 class Video:
-    """One camera's frames: encoded on a separate thread unless they arrive as JPEG.
+    """One camera's frames. They are encoded on a separate thread unless they arrive as JPEG.
 
-    If the vehicle's encoding is kept, frames are subscribed to only while its stream does not arrive.
+    If the vehicle's encoding is kept, decoded frames are subscribed to only while its stream does not arrive.
     """
 
     def __init__(
@@ -258,7 +258,7 @@ class Video:
 
     @property
     def dropped(self) -> int:
-        """Frames that the encoder skipped or failed on, or that can't be decoded."""
+        """Frames that the encoder skipped or could not encode, or that can't be decoded."""
         return self._buffer.dropped + self._failed + (self._stream.dropped if self._stream is not None else 0)
 
     @property
@@ -282,11 +282,11 @@ class Video:
         with self._lock:
             self._ended = True
         self._buffer.close()
-        if self._thread.ident is not None:  # start() may have failed before starting it
+        if self._thread.ident is not None:  # start() may have failed before starting the thread
             self._thread.join()
 
     def check_stream(self, now_ns: int) -> None:
-        """Subscribe to frames while the vehicle's stream does not arrive (it may differ from the announced one)."""
+        """Subscribe to frames while the vehicle's stream does not arrive (it may differ from what was announced)."""
         if self._stream is not None:
             self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
 
@@ -318,7 +318,7 @@ class Video:
             arrival = self._buffer.wait()
             if arrival is not None:
                 self._encode_one(arrival)
-            del arrival  # otherwise its frame slot stays leased while waiting for the next one
+            del arrival  # otherwise its frame slot would stay leased while waiting for the next one
 
     def _encode_one(self, arrival: Arrival) -> None:
         try:
@@ -342,7 +342,7 @@ class Video:
 
 
 def encoder(options: Options) -> Encode:
-    """Return a function that encodes images, shape (height, width, 3) BGR or (height, width), uint8.
+    """Return a function that encodes images of shape (height, width, 3), BGR, or (height, width); uint8.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -351,7 +351,7 @@ def encoder(options: Options) -> Encode:
         import cv2
     except ImportError as error:
         raise MissingExtraError("recording raw frames", "record", cause=str(error)) from None
-    if options.encoding == "png":  # level 1: twice as fast as the default and hardly larger
+    if options.encoding == "png":  # level 1 is twice as fast as the default, and files are hardly larger
         suffix, settings = ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]
     else:
         suffix, settings = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, options.quality]
@@ -388,11 +388,11 @@ class Parameters:
         """End the thread."""
         self._ended = True
         self._wake.set()
-        if self._thread.ident is not None:  # start() may have failed before starting it
+        if self._thread.ident is not None:  # start() may have failed before starting the thread
             self._thread.join()
 
     def event(self, event: Event) -> None:
-        """Read again after a parameter was written or a link came back."""
+        """Read the parameters again after one was written or a link was restored."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._wake.set()
@@ -407,7 +407,7 @@ class Parameters:
             again = None if self._read_all() else _PARAMETERS_S
 
     def _read_all(self) -> bool:
-        """Read the parameters; return whether they could be read."""
+        """Read the parameters; return whether that succeeded."""
         try:
             parameters = self._drone.config.parameters()
         except Exception as error:  # noqa: BLE001  (read again later; if the thread ended, no change would be recorded)

@@ -1,4 +1,4 @@
-"""Translate received samples to messages of a file: Skyloop's own, and others for viewers. Pure."""
+"""Translate received samples to messages in a file: Skyloop's own, and others for viewers. Pure."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, Res
 from skyloop.recording.output import Message
 
 _SEQUENCES: Final = 1 << 32  # MCAP's sequence numbers have 32 bits
-_PLACES: Final = 400  #: greatest number of places of a path; beyond it, remove every second one
-_PATH_EVERY_NS: Final = 1_000_000_000  # between messages of a path
+_PLACES: Final = 400  #: maximum number of points in a path; when it is exceeded, every second one is removed
+_PATH_EVERY_NS: Final = 1_000_000_000  # interval between messages that hold a path
 
 
 class Picture:
-    """A frame as written to the file."""
+    """A frame in the form written to the file."""
 
     __slots__ = ("data", "record")
 
@@ -44,7 +44,7 @@ class Picture:
 
 
 class Path:
-    """The places where a drone has been, oldest first, thinned out to a limited number."""
+    """The points of a drone's path, oldest first, thinned out to a limited number."""
 
     def __init__(self) -> None:
         self.places: list[Any] = []
@@ -52,7 +52,7 @@ class Path:
         self._count = 0
 
     def add(self, place: Any) -> None:
-        """Append a place, or skip it to keep the distance between places."""
+        """Append a point, or skip it if it is too close to the last one."""
         if self._count % self._step == 0:
             self.places.append(place)
             if len(self.places) > _PLACES:
@@ -62,12 +62,12 @@ class Path:
 
 
 class Translator:
-    """Creates the messages of one drone."""
+    """Creates the messages for one drone."""
 
     def __init__(
         self, drone: str, capabilities: Capabilities, clock: ClockPair, offset_ns: Callable[[], int] = lambda: 0
     ) -> None:
-        """Initialise the translator; ``offset_ns`` returns the proxy's clock minus the recorder's."""
+        """Initialise the translator. ``offset_ns`` returns the proxy's clock minus the recorder's."""
         self._drone = drone
         self._cameras = capabilities.cameras
         self._camera_names = frozenset(camera.name for camera in capabilities.cameras)
@@ -93,7 +93,7 @@ class Translator:
         }
 
     def messages(self, item: Item) -> Iterator[Message]:
-        """Create the messages of a sample."""
+        """Create the messages for a sample."""
         return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
 
     def prelude(self, now_ns: int) -> Iterator[Message]:
@@ -159,8 +159,8 @@ class Translator:
 
     def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(entry.at_ns)
-        # Applications choose an entry's own time, which is in the entry. As publish times these would run backwards,
-        # and viewers would re-sort the whole topic.
+        # Applications choose an entry's own time, which is kept inside the entry. If it were used as the publish time,
+        # times could run backwards and viewers would re-sort the whole topic.
         yield self._own(Channel.LOGS, entry, log_ns, log_ns)
         if entry.name == MOCAP and entry.values is not None and len(entry.values) >= 7:
             pose = foxglove.pose_in_world(at_ns, foxglove.pose_of(entry.values))
@@ -174,7 +174,7 @@ class Translator:
         try:
             value = _listed(unpack(result.payload))
         except DecodeError:
-            value = None  # a payload that can't be decoded has no value
+            value = None  # a payload that can't be decoded is recorded without a value
         record = ResultRecord(
             result.processor,
             result.worker,
@@ -224,7 +224,7 @@ class Translator:
 
 
 def _listed(value: Any) -> Any:
-    """Convert to JSON types: arrays to lists, keys to strings."""
+    """Convert to JSON types: arrays become lists, keys become strings."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""A live view of drones: subscribes to a screen's sources and passes it their samples on a separate thread."""
+"""Show drones live: subscribe to the sources that a screen needs and pass it their samples on a separate thread."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from skyloop.recording.backlog import Backlog, Item
 from skyloop.recording.options import MB, Options
 from skyloop.recording.taps import Tap, check_names
 
-BEAT_S: Final = 0.02  #: period of polling the backlog, so that receiving threads need not wake the view
-_BATCH: Final = MB  # bytes to show before asking the screen for its sources again
-_LIMIT: Final = 16 * MB  # bytes that can wait for a slow screen; older images are useless to a viewer
-_RESERVE: Final = 16 * MB  # bytes beyond that for samples that must not be dropped
-_QUALITY: Final = 80  # JPEG quality: these images are viewed, not kept
-_LOOK_NS: Final = nanoseconds(1.0)  # how often to check the streams
+BEAT_S: Final = 0.02  #: interval between polls of the backlog; polling spares receiving threads from waking the view
+_BATCH: Final = MB  # bytes to show before asking the screen again which sources it needs
+_LIMIT: Final = 16 * MB  # bytes held for a slow screen; older images are useless to a viewer
+_RESERVE: Final = 16 * MB  # bytes above that limit for samples that must not be dropped
+_QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
+_LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the streams
 NICENESS: Final = 5
 
 #: A drone's index, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
@@ -30,28 +30,28 @@ _log = logging.getLogger(__name__)
 
 
 class Screen(Protocol):
-    """Shows samples to people. All methods except :meth:`close` are called on the view's thread."""
+    """Displays samples. All methods except :meth:`close` are called on the view's thread."""
 
     def wanted(self) -> frozenset[Source]:
-        """Return the sources on display now; nothing else is subscribed to."""
+        """Return the sources currently on display; only these are subscribed to."""
 
     def show(self, item: Item) -> None:
         """Show a sample."""
 
     def close(self) -> None:
-        """Close the screen. The view's thread has already ended."""
+        """Close the screen. Called after the view's thread has ended."""
 
 
 class View:
     """Shows drones on a screen from :meth:`start` to :meth:`close`. Use it as a context manager.
 
     Attributes:
-        failed: Samples that could not be shown.
+        failed: Number of samples that could not be shown.
         failed_why: Channel and error of the last one.
     """
 
     def __init__(self, drones: Sequence[Drone], screen: Screen) -> None:
-        """Initialise without subscribing; the view closes the screen.
+        """Initialise without subscribing. The view closes the screen.
 
         Raises:
             UsageError: Two drones have the same name.
@@ -89,7 +89,7 @@ class View:
 
     @property
     def subscribed(self) -> dict[str, list[str]]:
-        """Current subscriptions by drone. Can be read from any thread."""
+        """Current subscriptions by drone. Safe to read from any thread."""
         found: dict[str, list[str]] = {}
         for number, channel in sorted(self._taps):
             found.setdefault(self._drones[number].name, []).append(channel)
@@ -97,7 +97,7 @@ class View:
 
     @property
     def dropped(self) -> int:
-        """Samples dropped because the screen or the encoder was too slow. Can be read from any thread."""
+        """Samples dropped because the screen or the encoder was too slow. Safe to read from any thread."""
         return sum(tuple(self._backlog.dropped.values()))
 
     # The thread ------------------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class View:
             _log.exception("the view continues after an error")
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:
-        """Subscribe to the wanted sources and show received samples. Called by the thread, or by a test."""
+        """Subscribe to the sources needed and show received samples. Called by the thread, or by a test."""
         self._subscribe(frozenset() if ending else self._screen.wanted())
         for item in self._backlog.take(_BATCH):
             try:
@@ -140,6 +140,6 @@ class View:
 
 
 def give_way() -> None:
-    """Lower the priority of this process and of threads that it starts later: the flight has priority."""
+    """Lower the priority of this process and of threads that it starts later, because the flight has priority."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)

@@ -1,4 +1,4 @@
-"""The writing thread: takes samples from the backlog, translates and writes them, and watches the disk."""
+"""The writing thread: takes samples from the backlog, translates and writes them, and monitors the disk."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from skyloop.recording.options import MB, Options, RecorderState, Room, judge_ro
 from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open_target
 from skyloop.recording.translation import Picture, Translator
 
-BEAT_S: Final = 0.05  #: period of polling the backlog, so that receiving threads need not wake the writer
+BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
 _COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
-_REOPEN: Final = 4 * MB  #: bytes that must be free before opening a new file on a disk that was full
-#: How long to continue a full file until a key frame: cameras outside drones send one every 10 s or so.
+_REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
+#: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
-_SILENCE_NS: Final = nanoseconds(2.0)  #: without H.264 for this long, a full file does not wait for a key frame
-_LOOK_NS: Final = nanoseconds(1.0)  #: period of checking the disk, and of retrying a file that can't be written
+_SILENCE_NS: Final = nanoseconds(2.0)  #: if no H.264 arrives for this long, a full file does not wait for a key frame
+_LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk, and between attempts to resume writing
 
 Tell = Callable[[str, Severity], None]
 _log = logging.getLogger(__name__)
@@ -45,17 +45,17 @@ def free_space(folder: Path) -> int:
 
 
 class FileWriter:
-    """Writes a backlog to one file or several in turn. Its public attributes can be read from any thread.
+    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread.
 
     Attributes:
         state: State of the recorder.
         reason: Why the recorder is paused or has failed.
         files: All files, oldest first.
-        room: Samples to write, by the space left on the disk.
+        room: Which samples to write, given the space left on the disk.
         unwritable: Samples that could not be translated.
         unwritable_why: Channel and error of the last one.
         dropped: Returns the totals of dropped samples by drone and channel, for the end of each file.
-        missed: Returns the totals of missed samples likewise.
+        missed: Returns the totals of missed samples by drone and channel, for the end of each file.
         each_second: Called each second on the writing thread.
     """
 
@@ -72,14 +72,14 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise without opening a file; ``tell`` runs on the writing thread, at first on :meth:`start`'s."""
+        """Initialise without opening a file. ``tell`` runs on the writing thread, or at first on :meth:`start`'s."""
         self.state = RecorderState.STARTING
         self.reason = ""
         self.files: list[Path] = []
         self.room = Room.ALL
-        self.unwritable = 0  #: samples that could not be translated
+        self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last one
-        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: totals for the end of each file
+        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
         self.each_second: Callable[[], None] = lambda: None
         self._path = path
@@ -97,7 +97,7 @@ class FileWriter:
         self._closed_bytes = self._closed_messages = 0
         self._now_ns = clock.monotonic_ns
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
-        self._due_ns = 0  # time since which a new file is due
+        self._due_ns = 0  # time at which a new file became due
         self._chains: dict[tuple[int, str], Chain] = {}  # H.264 in this file, by drone and channel
         self._encoded_ns = 0  # time of the last H.264 frame written
         self._closing = threading.Event()
@@ -124,31 +124,31 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write all received samples and close the file; leave a disk that hangs longer to the thread. Idempotent."""
+        """Write all received samples and close the file. If the disk hangs, leave it to the thread. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
 
     @property
     def shown_reason(self) -> str:
-        """Why it is paused, has failed or leaves frames out."""
+        """Why it is paused, has failed or is leaving frames out."""
         short = self.state is RecorderState.RECORDING and self.room is Room.NO_FRAMES
         return "the disk is nearly full: no frames are recorded" if short else self.reason
 
     @property
     def path(self) -> Path:
-        """The current or last file."""
+        """The current file, or the last one."""
         return self.files[-1] if self.files else self._path
 
     @property
     def bytes(self) -> int:
-        """Bytes in all files so far."""
+        """Bytes written so far, in all files."""
         file = self._file
         return self._closed_bytes + (0 if file is None else file.size)
 
     @property
     def messages(self) -> int:
-        """Messages in all files so far."""
+        """Messages written so far, in all files."""
         file = self._file
         return self._closed_messages + (0 if file is None else file.count)
 
@@ -163,12 +163,12 @@ class FileWriter:
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # retry once more if paused, and report the last counts
+        self._look_due_ns = 0  # if paused, try once more; and write the final counts
         self.step(time.monotonic_ns())
         self._end()
 
     def _fail(self, error: Exception) -> None:
-        """End after an unexpected error: set the state, report the error, keep the committed data."""
+        """Stop after an unexpected error: set the state, report the error and keep the committed data."""
         self.state, self.reason = RecorderState.FAILED, f"an error in the recorder: {error!r:.300}"
         _log.exception("the recording to %s ends", self.path)
         file, self._file = self._file, None
@@ -181,7 +181,7 @@ class FileWriter:
             self._report(text, Severity.ERROR)
 
     def step(self, now_ns: int) -> None:
-        """Do the work due at a time [ns, monotonic]. Called by the thread, or by a test."""
+        """Do the work that is due at a time [ns, monotonic]. Called by the thread, or by a test."""
         self._now_ns = now_ns
         try:
             if now_ns >= self._look_due_ns:
@@ -195,7 +195,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate and write everything that waits, committing along the way."""
+        """Translate and write all waiting samples, committing along the way."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
@@ -215,7 +215,7 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # before writing, so that nothing is lost if the disk fails meanwhile
+        self._uncommitted += batch  # before writing, so that nothing is lost if the disk fails in the middle
         for item in batch:
             for message in self._messages(item):
                 file.write(message)
@@ -223,7 +223,7 @@ class FileWriter:
             self._commit()
 
     def _messages(self, item: Item) -> list[Message]:
-        """Translate a sample completely, or return nothing if it can't be translated."""
+        """Return all of a sample's messages, or none if the sample can't be translated."""
         try:
             return list(self._translators[item.drone].messages(item))
         except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
@@ -240,7 +240,7 @@ class FileWriter:
         return False
 
     def _follows(self, item: Item) -> bool:
-        """Return whether a frame can be decoded from this file alone."""
+        """Return whether a frame can be decoded using this file alone."""
         if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
             return True
         record = item.sample.record
@@ -265,7 +265,7 @@ class FileWriter:
         )
 
     def _rotate_when_due(self) -> None:
-        """Start a new file when due; with H.264, :meth:`_write` does so at a key frame, unless none arrives."""
+        """Start a new file when due. With H.264, :meth:`_write` does so at a key frame, unless none arrives."""
         if not self._rotation_due():
             return
         self._due_ns = self._due_ns or self._now_ns
@@ -281,7 +281,7 @@ class FileWriter:
 
     def _open(self) -> None:
         number = len(self.files) + 1
-        # The user did not choose the name of a file after a pause: it must not overwrite anything.
+        # The user did not choose the name of the file that follows a pause, so it must not overwrite anything.
         overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
         first = number == 1 and not self._options.rotates
         path = self._path if first else self._next_free(number, overwrite)
@@ -324,7 +324,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """Pause because the disk fails. Uncommitted samples wait for the next file."""
+        """Pause because the disk fails. Samples not yet committed wait for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
@@ -371,13 +371,13 @@ class FileWriter:
 
 
 def _is_key(item: Item) -> bool:
-    """Return whether decoding a stream can start at this frame."""
+    """Return whether a stream can be decoded starting at this frame."""
     sample = item.sample
     return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
 
 
 def _why(error: OSError) -> str:
-    """Describe an error for people."""
+    """Describe an error in words that users understand."""
     place = f": {error.filename}" if error.filename else ""
     return f"{error.strerror or error}{place}"
 

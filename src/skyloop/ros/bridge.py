@@ -1,4 +1,4 @@
-"""Drones as nodes of ROS 2: connect to each, and wire its topics, services and parameters."""
+"""Drones as nodes of ROS 2: connect to each drone and set up its topics, services and parameters."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_m
 
 PURPOSE: Final = "the bridge to ROS 2"
 MESSAGES: Final = ("sensor_msgs.msg", "geometry_msgs.msg", "nav_msgs.srv", "std_srvs.srv", "std_msgs.msg")
-UPDATE_S: Final = 0.2  #: between checks for subscribers to images
-_WAITING: Final = 4  #: services of a drone that may wait at the same time
+UPDATE_S: Final = 0.2  #: interval between checks for subscribers to images
+_WAITING: Final = 4  #: number of a drone's services that may wait at the same time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,19 +29,19 @@ class Settings:
     """Options of a bridge.
 
     Attributes:
-        drones: Names of running proxies, each a namespace.
-        priority: Request the authority at once with this priority, 0 (highest) to 31, and use it in the service as
-            well; None: only the service requests it, with the default.
-        timeout_s: Silence of ``cmd_vel`` after which the drone hovers, above 0 up to 5 s.
-        map_frame: A common frame for all drones' ``odom``, if one simulator or motion capture system locates them
-            all; empty: none.
-        use_sim_time: Stamps on the clock of ``/clock``.
-        domain: DDS domain; None: from ``ROS_DOMAIN_ID``.
-        subnet: Make it visible to other machines, unless the environment configures discovery; else to this one only.
-        arguments: For ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``.
+        drones: Names of running proxies; each becomes a namespace.
+        priority: Request the authority immediately with this priority, 0 (highest) to 31, and use the same priority in
+            the service. None: only the service requests it, with the default priority.
+        timeout_s: The drone hovers if ``cmd_vel`` is silent for this long; must be greater than 0 and at most 5 s.
+        map_frame: A common frame for all drones' ``odom``, if a single simulator or motion capture system locates them;
+            empty: none.
+        use_sim_time: Use the time from ``/clock`` for stamps.
+        domain: DDS domain; None: taken from ``ROS_DOMAIN_ID``.
+        subnet: Make the nodes visible to other machines, not only this one, unless the environment configures it.
+        arguments: Arguments for ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``.
 
     Raises:
-        UsageError: A value is out of range, or two drones have one name in ROS 2.
+        UsageError: A value is out of range, or two drones have the same name in ROS 2.
     """
 
     drones: tuple[str, ...]
@@ -64,20 +64,20 @@ class Settings:
 
 
 class Bridge:
-    """Connects drones to ROS 2 within a ``with`` block. On exit it lands the drones that it flies.
+    """Connects drones to ROS 2 within a ``with`` block. On exit, it lands the drones that it flies.
 
     Raises on entering:
-        MissingExtraError: rclpy or a package of messages is not installed.
+        MissingExtraError: rclpy or a message package is not installed.
         UsageError: ROS 2 refuses its arguments.
-        SkyloopError: A drone can't be connected, or with ``priority``, the authority is refused.
+        SkyloopError: Connecting to a drone failed or, with ``priority``, the authority was refused.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._stack = ExitStack()
         self._cameras: list[CameraPublisher] = []
-        self.drones: dict[str, Drone] = {}  #: by name
-        self.namespaces = namespaces_of(settings.drones)  #: by name, without a slash
+        self.drones: dict[str, Drone] = {}  #: keyed by name
+        self.namespaces = namespaces_of(settings.drones)  #: namespaces by drone name, without a slash
 
     def __enter__(self) -> Self:
         settings = self._settings
@@ -103,7 +103,7 @@ class Bridge:
         self._stack.close()
 
     def run(self, stopping: threading.Event | None = None, shown: Callable[[], object] | None = None) -> None:
-        """Serve until the event is set, or an exception such as KeyboardInterrupt; call ``shown`` periodically."""
+        """Serve until the event is set or an exception such as KeyboardInterrupt occurs; call ``shown`` regularly."""
         stopping = stopping or threading.Event()
         while True:
             for camera in self._cameras:
@@ -114,9 +114,9 @@ class Bridge:
                 return
 
     def _add(self, context: RosContext, drone: Drone, namespace: str) -> tuple[Any, Any]:
-        """Wire a drone; return the node whose callbacks may wait, and the one whose callbacks never do."""
+        """Set up a drone; return the node whose callbacks may wait, and the one whose callbacks never do."""
         settings = self._settings
-        # No node may present the borrowed type of transforms as something else (skyloop.ros.names).
+        # No node may publish the type that transforms borrow under another name (skyloop.ros.names).
         own = {"use_sim_time": settings.use_sim_time, "start_type_description_service": False}
         node = context.node("skyloop", namespace, own)
         topics = context.node("skyloop_commands", namespace, own)
@@ -126,14 +126,14 @@ class Bridge:
         Telemetry(node, drone, time, frames)
         self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
         pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
-        self._stack.callback(pilot.close)  # before disconnecting from the drone, which lands it
+        self._stack.callback(pilot.close)  # close the pilot before disconnecting from the drone, which lands it
         if settings.priority is not None:
             pilot.request_authority()
         return node, topics
 
 
 def _connect(name: str, timeout_s: float) -> Drone:
-    """Connect as a pilot without requesting the authority yet."""
+    """Connect as a pilot, without requesting the authority yet."""
     return open_unasked(Drone, dial_by_name(name), app="skyloop ros", timeout_s=NAME_TIMEOUT_S, stall_s=timeout_s)
 
 

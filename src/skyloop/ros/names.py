@@ -1,10 +1,10 @@
-"""Requirements of ROS 2: names of a drone's namespace and frames (REP 105), its time, and its type of transforms.
+"""What ROS 2 requires: names of a drone's namespace and frames (REP 105), its time, and its type for transforms.
 
-rclpy lacks ``tf2_msgs/msg/TFMessage`` if its package is not installed, so the publisher sends ready-made bytes. rclpy
-gets a *type support* from a message's class: a C structure with its name, the hash of its definition and functions that
-serialise it (``rosidl_message_type_support_t`` and, for Fast DDS, ``message_type_support_callbacks_t``). A publisher of
-bytes calls only one of these functions, the one for the largest size, and unbounded members make that size unknown. The
-functions of another message with such members therefore work, under the name and hash of this one.
+rclpy lacks ``tf2_msgs/msg/TFMessage`` if that message's package is not installed, so the publisher sends ready-made
+bytes. rclpy gets a *type support* from a message's class: a C structure with the message's name, the hash of its
+definition, and functions that serialise it (``rosidl_message_type_support_t`` and, for Fast DDS,
+``message_type_support_callbacks_t``). A publisher of bytes calls only the one that returns the largest size, which
+unbounded members make unknown. The functions of another such message therefore work, under this one's name and hash.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.vehicles.ros2.node import ros_name
 from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME, ClockMap
 
-KNOWN_MAJOR: Final = "9"  #: version of the package ros-rclpy with these structures
+KNOWN_MAJOR: Final = "9"  #: version of the package ros-rclpy that has these structures
 _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of a drone's frames; each begins with the drone's name, as several drones share one tree.
+    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree.
 
     Attributes:
         drone: The drone's name, as a valid ROS 2 name.
-        map: The frame in which all drones' ``odom`` start at the same position; empty: none.
+        map: The frame in which all drones' ``odom`` have the same origin; empty: none.
     """
 
     drone: str
@@ -41,16 +41,16 @@ class Frames:
 
     @property
     def odom(self) -> str:
-        """The drone's world axes, x east, y north, z up: continuous, with possible drift."""
+        """The drone's world axes, x east, y north, z up: continuous, but may drift."""
         return f"{self.drone}/odom"
 
     @property
     def base(self) -> str:
-        """The body, x forward, y left, z up."""
+        """The drone's body axes, x forward, y left, z up."""
         return f"{self.drone}/base_link"
 
     def optical(self, camera: str) -> str:
-        """Return a camera's optical axes, x right, y down, z forward (the suffix is REP 103's)."""
+        """Return the name of a camera's optical axes, x right, y down, z forward (the suffix comes from REP 103)."""
         return f"{self.drone}/{ros_name(camera)}_optical_frame"
 
 
@@ -58,7 +58,7 @@ def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
     """Return each drone's namespace, without a slash.
 
     Raises:
-        UsageError: Two drones would have the same one.
+        UsageError: Two drones would have the same namespace.
     """
     found: dict[str, str] = {}
     for name in drones:
@@ -71,7 +71,7 @@ def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
 
 
 class RosTime:
-    """Stamps for a drone's samples on a node's clock: the system's, or with ``use_sim_time`` that of ``/clock``."""
+    """Stamps a drone's samples on a node's clock: the system clock or, with ``use_sim_time``, that of ``/clock``."""
 
     def __init__(self, node: Any, drone: Drone) -> None:
         self._clock = node.get_clock()
@@ -80,12 +80,12 @@ class RosTime:
         self._lock = threading.Lock()
 
     def stamp_ns(self, captured_ns: int) -> int | None:
-        """Return the ROS time of a capture on the proxy's clock [ns]; None if there is none. Any thread."""
+        """Return the ROS time of a capture time on the proxy's clock [ns], or None if there is none. Any thread."""
         with self._lock:
             return self._map.to_ros(captured_ns, self._drone.now_ns, self._clock.now().nanoseconds)
 
     def age_s(self, stamp_ns: int) -> float:
-        """Return the age of a stamp [s], by the node's clock."""
+        """Return the age of a stamp according to the node's clock [s]."""
         return float(self._clock.now().nanoseconds - stamp_ns) / 1e9
 
 
@@ -124,11 +124,11 @@ class _TypeHash(ctypes.Structure):
 
 _Find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 _Hash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-_kept: list[Any] = []  # memory that rclpy keeps pointers to, for the life of this process
+_kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of this process
 
 
 def tf_message_type() -> type:
-    """Return the type for a publisher of transforms that sends ready-made bytes.
+    """Return a type for a publisher of transforms that sends ready-made bytes.
 
     Raises:
         UnsupportedError: The message's package is not installed, and this version of rclpy is not supported.
@@ -185,7 +185,7 @@ def _borrowed() -> type:
 
 
 def forget_error() -> None:
-    """Clear the error that ROS 2 stored on this thread when it looked for functions that this type lacks.
+    """Clear the error that ROS 2 stored on this thread when it looked for functions that the type lacks.
 
     Otherwise ROS 2 prints it together with the next error.
     """

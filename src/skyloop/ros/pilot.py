@@ -1,4 +1,4 @@
-"""Control of a drone through ROS: flights by topics and services, with the authority for them, and its parameters."""
+"""Control of a drone through ROS: flying by topics and services, with the authority to do so, and its parameters."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
-NEAR_M: Final = 0.2  #: tolerance of a goal without its own
-WARN_AGAIN_S: Final = 5.0  #: between two warnings of the same kind
+NEAR_M: Final = 0.2  #: tolerance for a goal that has none of its own
+WARN_AGAIN_S: Final = 5.0  #: interval between warnings of the same kind
 
 
 class Pilot:
-    """Turns messages on topics and service calls into commands. Commands need the authority.
+    """Converts messages on topics and service calls to commands. Commands need the authority.
 
     Args:
-        topics: Node of rclpy whose callbacks never wait, in the drone's namespace.
-        services: Node whose callbacks may wait, several at a time.
-        drone: Connected as a pilot, with the time after which a velocity turns into hover.
-        time: Stamps.
+        topics: The rclpy node whose callbacks never wait, in the drone's namespace.
+        services: The node whose callbacks may wait, several at a time.
+        drone: The drone, connected as a pilot, with the time after which a velocity becomes a hover.
+        time: Provides the stamps.
         frames: Names of the drone's frames.
-        priority: Priority of authority requests, 0 (highest) to 31; None: the default.
-        timeout_s: How old a stamped velocity may be [s].
+        priority: Priority for requesting the authority, 0 (highest) to 31; None: the default.
+        timeout_s: Maximum age of a stamped velocity [s].
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class Pilot:
         self._timeout_s = timeout_s
         self._log = topics.get_logger()
         self._lock = threading.Lock()
-        self._under_way: list[str] = []  # services that wait for the drone
-        # Keep only the newest sample, from reliable and best-effort publishers alike.
+        self._under_way: list[str] = []  # services that are waiting for the drone
+        # Keep only the newest sample, from both reliable and best-effort publishers.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
         topics.create_subscription(PoseStamped, "goal_pose", self.on_goal, newest)
         group = ReentrantCallbackGroup()
-        # These never wait, and must not queue behind services that do.
+        # These never wait, and must not be queued behind services that do.
         topics.create_service(Trigger, "hover", self._trigger("hover", drone.hover))
         topics.create_service(Trigger, "emergency_stop", self._trigger("emergency_stop", drone.emergency_stop))
         actions: dict[str, Callable[[], object]] = {
@@ -80,25 +80,25 @@ class Pilot:
         """Request the authority with the configured priority.
 
         Raises:
-            AuthorityError: Another application, named in the error, has it.
+            AuthorityError: Another application, named in the error, holds the authority.
         """
         self._drone.request_authority(self._priority)
 
     def close(self) -> None:
-        """Ignore further messages on topics, so that they do not abort the final landing."""
+        """Ignore further messages on topics, so that they can't abort the final landing."""
         with self._lock:
             self._under_way.append("the end of the bridge")
 
     # Topics: never wait ----------------------------------------------------------------------------------------------
 
     def on_velocity(self, twist: Any) -> None:
-        """Fly with the velocity of a ``geometry_msgs/Twist`` (levelled axes); rates of roll and pitch are ignored."""
+        """Fly at the velocity in a ``geometry_msgs/Twist`` (levelled axes); roll and pitch rates are ignored."""
         linear, angular = twist.linear, twist.angular
         rates = {"forward": linear.x, "left": linear.y, "up": linear.z, "yaw_rate": angular.z}
         self._unless_occupied("cmd_vel", lambda: self._drone.velocity(**rates))
 
     def on_stamped_velocity(self, message: Any) -> None:
-        """Fly with the velocity of a ``TwistStamped``, unless it is too old or in another frame."""
+        """Fly at the velocity in a ``TwistStamped``, unless it is too old or in another frame."""
         frame = message.header.frame_id
         stamp_ns = nanoseconds_of(message.header.stamp)
         age_s = self._time.age_s(stamp_ns) if stamp_ns else 0.0
@@ -111,7 +111,7 @@ class Pilot:
             self.on_velocity(message.twist)
 
     def on_goal(self, pose: Any) -> None:
-        """Fly to a pose, without waiting."""
+        """Fly to a pose without waiting for arrival."""
 
         def fly() -> None:
             place = self._place(pose)
@@ -120,10 +120,10 @@ class Pilot:
         self._unless_occupied("goal_pose", fly)
 
     def _unless_occupied(self, topic: str, send: Callable[[], object]) -> None:
-        """Send a set-point, unless a service is running: programs keep publishing while they wait for it.
+        """Send a set-point, unless a service is running: programs keep publishing while they wait for one.
 
-        The lock is the one that a service takes before it begins; otherwise a velocity checked before a landing could
-        be sent after it. ``send`` does not wait.
+        A service takes the same lock before it begins; otherwise a velocity checked before a landing could be sent
+        after it. ``send`` does not wait.
         """
         try:
             with self._lock:
@@ -152,11 +152,11 @@ class Pilot:
     def _place(self, pose: Any) -> dict[str, float]:
         """Return the arguments of ``go_to`` for a ``PoseStamped``.
 
-        A pose drawn in a plane has no height: z = 0 keeps the present one. A missing orientation keeps the present
-        heading.
+        A pose drawn in a plane has no height, so z = 0 keeps the current height. A missing orientation keeps the
+        current heading.
 
         Raises:
-            UsageError: It is in another frame, its numbers are not finite, or its height is unknown.
+            UsageError: The pose is in another frame, its numbers are not finite, or its height is unknown.
         """
         frame, place, turn = pose.header.frame_id, pose.pose.position, pose.pose.orientation
         allowed = [each for each in ("odom", self._frames.odom, self._frames.map) if each]
@@ -171,7 +171,7 @@ class Pilot:
                 raise UsageError("the goal's height is 0 and the drone's own is unknown: give z")
             found["z"] = position[2]
         angles = euler_of((turn.x, turn.y, turn.z, turn.w))
-        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # a default message
+        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # the default of a new message
         if angles is not None and not as_made:
             found["yaw"] = angles[2]
         return found
@@ -194,7 +194,7 @@ class Pilot:
         return call
 
     def _go_to(self, request: Any, response: Any) -> Any:
-        """Fly to ``goal`` and wait; the plan is the straight path that was flown, or empty if it was not."""
+        """Fly to ``goal`` and wait. The plan is the straight path that was flown, or empty if there was none."""
         from geometry_msgs.msg import PoseStamped
 
         try:
@@ -215,16 +215,16 @@ class Pilot:
 
 
 def _in_words_of_ros(error: SkyloopError) -> str:
-    """Return the reason, with the equivalent services in place of Python calls."""
+    """Return the reason, naming the equivalent services in place of Python calls."""
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
 class Parameters:
-    """Declares the drone's parameters at a node, writes values set by ROS, and shows changes made elsewhere.
+    """Declares the drone's parameters on a node, writes values set through ROS, and shows changes made elsewhere.
 
     Args:
         node: The rclpy node. Setting a parameter waits for the drone's proxy.
-        drone: Connected as a pilot: writing needs the authority.
+        drone: The drone, connected as a pilot, because writing needs the authority.
     """
 
     def __init__(self, node: Any, drone: Drone) -> None:
@@ -237,13 +237,13 @@ class Parameters:
         drone.on_event(self._on_event)
 
     def _set(self, parameters: list[Any]) -> Any:
-        """Write the values that differ; the first refusal stops it, with the proxy's reason."""
+        """Write the values that differ. The first refusal stops this, with the proxy's reason."""
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
             known = self._known.get(each.name)
             if known is None or _same(known.value, each.value):
-                continue  # the node's own, or already set
+                continue  # the node's own parameter, or already set
             try:
                 self._drone.config[each.name] = each.value
                 self._known[each.name] = self._drone.config.describe(each.name)

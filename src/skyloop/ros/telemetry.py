@@ -1,4 +1,4 @@
-"""A drone's data for ROS: odometry, IMU, battery, geographic position, transforms, flight state, and its images."""
+"""Publish a drone's data to ROS: odometry, IMU, battery, geographic position, transforms, flight state and images."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from skyloop.vehicles.ros2.wire import (
     stamp_of,
 )
 
-SLOW_NS: Final = 1_000_000_000  #: period of battery and geographic position
+SLOW_NS: Final = 1_000_000_000  #: interval between battery states and between geographic positions
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 JPEG_QUALITY: Final = 90
 
 
 class Telemetry:
-    """Publishes each feedback to those topics that have subscribers."""
+    """Publishes each feedback sample on the topics that have subscribers."""
 
     def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:
         from geometry_msgs.msg import TwistStamped
@@ -158,7 +158,7 @@ class Telemetry:
         return message
 
     def _twist(self, feedback: Feedback) -> Any:
-        """Return velocity and rates in body axes; None if the velocity or the tilt is unknown."""
+        """Return velocity and rates in body axes; None if velocity or tilt is unknown."""
         from geometry_msgs.msg import Twist
 
         if feedback.velocity_m_s is None or feedback.roll_rad is None or feedback.pitch_rad is None:
@@ -208,8 +208,8 @@ class Telemetry:
         if origin is None or feedback.position_m is None:
             return None
         latitude_deg, longitude_deg, _ = origin.place_of(feedback.position_m)
-        # The altitude of a NavSatFix is above the ellipsoid, the vehicle's above the sea; the difference (up to 100 m)
-        # is unknown here.
+        # The altitude in a NavSatFix is above the ellipsoid, the vehicle's is above sea level; the difference (up to
+        # 100 m) is not known here.
         message = NavSatFix(latitude=latitude_deg, longitude=longitude_deg, altitude=math.nan)
         message.status.status = NavSatStatus.STATUS_FIX
         message.status.service = NavSatStatus.SERVICE_GPS
@@ -238,7 +238,7 @@ def _or_nan(value: float | None) -> float:
 
 
 class CameraPublisher:
-    """Publishes one camera while it has subscribers; without them it does not request frames."""
+    """Publishes one camera while there are subscribers; otherwise frames are not requested."""
 
     def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
         from rclpy.qos import qos_profile_sensor_data
@@ -266,12 +266,12 @@ class CameraPublisher:
 
     @property
     def watched(self) -> bool:
-        """Whether one of the topics has subscribers."""
+        """Whether any of the topics has subscribers."""
         publishers = (self._image, self._info, self._compressed)
         return any(each is not None and each.get_subscription_count() for each in publishers)
 
     def update(self) -> None:
-        """Subscribe to frames or unsubscribe; called a few times a second, from one thread."""
+        """Subscribe to frames or unsubscribe. Called a few times a second, on one thread."""
         watched = self.watched
         if watched and self._listener is None:
             self._listener = self._drone.on_frame(self.publish, self._camera.name)
@@ -298,7 +298,7 @@ class CameraPublisher:
         message.height, message.width = frame.shape[:2]
         message.encoding = "bgr8"
         message.step = 3 * message.width
-        pixels = array("B")  # rclpy accepts this type directly; bytes are converted one at a time
+        pixels = array("B")  # rclpy accepts this type directly; it would convert bytes one at a time
         pixels.frombytes(frame.data.cast("B"))
         message.data = pixels
         return message
@@ -308,7 +308,7 @@ class CameraPublisher:
         from sensor_msgs.msg import CompressedImage
 
         message = self._head(CompressedImage(), stamp_ns)
-        message.format = "bgr8; jpeg compressed bgr8"  # the wording of image_transport's compressed publisher
+        message.format = "bgr8; jpeg compressed bgr8"  # the format string of image_transport's publisher
         _, encoded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         message.data = array("B", encoded.tobytes())
         return message

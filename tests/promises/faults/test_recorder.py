@@ -226,4 +226,4 @@ def test_invalid_numbers_from_the_vehicle_are_unknown(rig: Rig) -> None:
     files.until(lambda: any(one.captured_ns == 1 for one in came), "it came")
     (sample,) = [one for one in came if one.captured_ns == 1]
     assert (sample.yaw_rad, sample.altitude_m, sample.velocity_m_s) == (None, 2.0, None)
-    files.until(lambda: any("yaw_rad, velocity_m_s came as NaN" in one.text for one in events), "it is told")
+    files.until(lambda: any("yaw_rad, velocity_m_s were NaN" in one.text for one in events), "it is told")

@@ -61,7 +61,7 @@ def test_reports_are_made_one_at_a_time_and_few_may_wait(tmp_path: Path) -> None
         refused = [task for task in wanted if task.done()]
         assert len(refused) == ASKED - 1 - MAX_WAITING
         for task in refused:
-            with pytest.raises(RefusedError, match="a report is being made and 4 wait"):
+            with pytest.raises(RefusedError, match="a report is being made and 4 are waiting"):
                 task.result()
         assert children.started == 1
         (tmp_path / "go").touch()

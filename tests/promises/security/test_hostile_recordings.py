@@ -392,7 +392,7 @@ def test_a_bad_file_is_a_row_with_its_reason(tmp_path: Path, flight: Path, monke
     bad.write_bytes(b"no recording")
     worse.write_bytes(flight.read_bytes())
     assert describe(good).drones == ("alpha",)
-    assert "no MCAP file" in describe(bad).problem
+    assert "not an MCAP file" in describe(bad).problem
     assert "No such file" in describe(tmp_path / "gone.mcap").problem
 
     def fail(_: Path) -> Recording:
@@ -437,7 +437,7 @@ def test_the_terminals_list_shows_all(
     assert "it begins with b'no recor'" in ended.out
     rows = {row["name"]: row for row in json.loads(log("list", tmp_path, "--json").out)}
     assert rows["good.mcap"]["drones"] == ["alpha"]
-    assert "no MCAP file" in rows["bad.mcap"]["problem"]
+    assert "not an MCAP file" in rows["bad.mcap"]["problem"]
     assert log("list", tmp_path / "gone").code == 2
     (tmp_path / "empty").mkdir()
     assert "No recording" in log("list", tmp_path / "empty").out

@@ -143,10 +143,10 @@ def present(**counts: tuple[int, bool]) -> list[tuple[str, bool]]:
     ("who", "flies", "here", "why"),
     [
         ("olga", False, present(olga=(PER_KEY - 1, False)), ""),
-        ("olga", False, present(olga=(PER_KEY, False)), "the key of 'olga' has"),
-        ("jane", True, present(jane=(PER_KEY, True)), "the key of 'jane' has"),
+        ("olga", False, present(olga=(PER_KEY, False)), "the key of 'olga' already has"),
+        ("jane", True, present(jane=(PER_KEY, True)), "the key of 'jane' already has"),
         ("jane", True, present(olga=(PER_KEY, False)), ""),
-        ("anna", False, present(**{f"o{n}": (PER_KEY, False) for n in range(3)}), "kept for pilots"),
+        ("anna", False, present(**{f"o{n}": (PER_KEY, False) for n in range(3)}), "reserved for pilots"),
         ("jane", True, present(**{f"o{n}": (PER_KEY, False) for n in range(3)}), ""),
         ("jane", True, present(**{f"o{n}": (PER_KEY, n == 0) for n in range(4)}), f"at most {MAX_CLIENTS}"),
     ],

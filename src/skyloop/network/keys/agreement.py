@@ -1,10 +1,10 @@
-"""A running process's keys: identities excluded by a newer roster, and the mutual proof of identity of two ends.
+"""The keys of a running process: identities excluded by a newer roster, and the mutual proof of identity of two ends.
 
-A link's certificates show the neighbour on that *link*, which may be a router. So the two ends of a connection also
-show theirs to each other, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each signs a fresh X25519
-share together with the terms of the connection, and the proxy also the application's whole message. The secrets,
-unknown to any router, are derived from both shares and the transcript (HKDF-SHA256). Hence recorded messages
-open nothing, and a key that is lost later opens no earlier recording.
+A link's certificates only identify the neighbour on that *link*, which may be a router. The two ends of a connection
+therefore also present their certificates to each other, in an exchange like those of SIGMA (Krawczyk, CRYPTO 2003) and
+TLS 1.3: each end signs a fresh X25519 share together with the terms of the connection; the proxy also signs the
+application's whole message. The secrets, unknown to any router, are derived from both shares and the transcript
+(HKDF-SHA256). Replayed messages are therefore useless, and a key that leaks later can't decrypt earlier recordings.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from skyloop.network.keys import certificates
 from skyloop.network.keys.credentials import Credentials, Roster
 from skyloop.network.keys.identity import Identity
 
-AGAIN: Final = timedelta(hours=1)  #: how often to announce an approaching expiry
+AGAIN: Final = timedelta(hours=1)  #: interval between warnings of an approaching expiry
 SECRET_BYTES: Final = 32
-_PURPOSE: Final = "fabric connection 1"  # prefix of all signed content, which no other signature has
+_PURPOSE: Final = "fabric connection 1"  # prefix of all content signed here; no other signature uses it
 _OFFER, _ANSWER = "offer", "answer"
 
 
 class KeyRing:
-    """Reads the key folder periodically. All methods may be called from any thread."""
+    """Reads the key folder periodically. All methods are thread-safe."""
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
-        #: Names revoked, or with changed rights, since this process applied its roster.
+        #: Names that were revoked, or whose rights changed, since this process applied its roster.
         self.shut_out: frozenset[str] = frozenset()
         self._in_force = credentials.roster
-        self._listed = frozenset(credentials.roster.identities)  # in the newest roster
+        self._listed = frozenset(credentials.roster.identities)  # identities in the newest roster
         self._stamp = _stamp(credentials)
         self._announced: dict[str, datetime] = {}
         self._pending: list[str] = []
@@ -49,31 +49,31 @@ class KeyRing:
 
     @property
     def roster(self) -> Roster:
-        """The newest roster read."""
+        """The newest roster that was read."""
         return self.credentials.roster
 
     @property
     def outdated(self) -> bool:
-        """Whether the newest roster differs from the one that this process applied."""
+        """Whether the newest roster differs from the one applied by this process."""
         return self._listed != frozenset(self._in_force.identities)
 
     def admits(self, identity: Identity) -> bool:
-        """Return whether the newest roster has this identity with these rights, and it was never excluded."""
+        """Return whether the newest roster lists this identity with these rights, and it was never excluded."""
         return identity in self._listed and identity.name not in self.shut_out
 
     def refresh(self) -> None:
-        """Read the roster if its file has changed; its messages wait for :meth:`poll`."""
+        """Read the roster if its file has changed; keep the resulting messages for :meth:`poll`."""
         with self._lock:
             self._pending += self._read()
 
     def poll(self, now: datetime | None = None) -> list[str]:
-        """Read the roster if its file has changed, and return messages for people.
+        """Read the roster if its file has changed, and return messages for users.
 
-        They announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported and
-        changes nothing.
+        These announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported, and
+        the previous one stays in force.
 
         Returns:
-            A sentence for each.
+            The messages, one sentence each.
         """
         now = now or datetime.now(UTC)
         with self._lock:
@@ -109,7 +109,7 @@ class KeyRing:
 
 
 def _stamp(credentials: Credentials) -> tuple[int, int, int]:
-    """Return values that change with the roster's file."""
+    """Return values that change whenever the roster's file does."""
     try:
         found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and called every second
     except OSError:
@@ -118,25 +118,25 @@ def _stamp(credentials: Credentials) -> tuple[int, int, int]:
 
 
 class Proof(msgspec.Struct, frozen=True, array_like=True):
-    """One end's proof to the other."""
+    """The proof that one end sends to the other."""
 
     certificate: bytes  #: DER
     share: bytes  #: X25519, 32 bytes
-    signature: bytes  #: ECDSA with SHA-256 by the key of the certificate, DER
+    signature: bytes  #: ECDSA with SHA-256, made with the certificate's key, DER
 
 
 @dataclass(frozen=True, slots=True)
 class Agreed:
     """The identity at the other end, and the secrets of this connection."""
 
-    identity: Identity  #: the other end's
-    expires: datetime  #: expiry of its certificate
-    up: bytes  #: for the application's packets
-    down: bytes  #: for the proxy's packets
+    identity: Identity  #: the other end's identity
+    expires: datetime  #: expiry of the other end's certificate
+    up: bytes  #: secret for the application's packets
+    down: bytes  #: secret for the proxy's packets
 
 
 class Agreement:
-    """One end's part in the exchange, with its keys; ``terms`` describe the connection, the same at both ends."""
+    """One end's part in the exchange, using its keys. ``terms`` describe the connection, alike at both ends."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -152,13 +152,13 @@ class Agreement:
         return self._offered
 
     def answer(self, offer: bytes, now: datetime | None = None) -> tuple[bytes, Agreed]:
-        """Check the application's offer, and make the proxy's answer.
+        """Check the application's offer and create the proxy's answer.
 
         Returns:
             The answer, a :class:`Proof` as MessagePack, and the agreed secrets.
 
         Raises:
-            LinkError: The other end could not prove an identity that the roster admits.
+            LinkError: The other end did not prove an identity that the roster admits.
         """
         proof = _decode(offer)
         identity, expires = self._check(proof, self._claim(_OFFER, proof.share), now)
@@ -172,7 +172,7 @@ class Agreement:
             The agreed secrets.
 
         Raises:
-            LinkError: The other end could not prove an identity that the roster admits.
+            LinkError: The other end did not prove an identity that the roster admits.
         """
         proof = _decode(answer)
         claim = self._claim(_ANSWER, proof.share, self._offered)

@@ -1,8 +1,8 @@
-"""Create, read and check X.509 certificates of a lab's authority and identities. Times are arguments, in UTC.
+"""Create, read and check X.509 certificates of a lab's authority and identities. Times are passed as arguments, in UTC.
 
-An identity's common name is its name, which Zenoh's access control uses. Its role and drones are a URI among its
-alternative names, ``urn:skyloop:ROLE:DRONES``. Only certificates of proxies and routers may accept connections
-(extended key usage), so that no holder can impersonate a proxy with the key of a pilot or an observer.
+The certificate's common name is the identity's name, which Zenoh's access control uses. Its role and drones are in the
+URI ``urn:skyloop:ROLE:DRONES`` among the alternative names. Only certificates of proxies and routers may accept
+connections (extended key usage), so that nobody can impersonate a proxy with the key of a pilot or an observer.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ try:
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:  # installed wherever tests run
+except ImportError as error:  # always installed where tests run
     raise MissingExtraError("keys", "network", cause=str(error)) from None
 
 PrivateKey = ec.EllipticCurvePrivateKey
 Certificate = x509.Certificate
 
-#: Certificates are valid from a day ago, for machines whose clocks are slow.
+#: Certificates are valid from a day before they are issued, for machines whose clocks are slow.
 BACKDATED: Final = timedelta(days=1)
-#: What a page authority may certify: private networks (RFC 1918, 4193, 3927, 6598) and this machine …
+#: What a page authority may certify: private networks (RFC 1918, 4193, 3927, 6598), this machine …
 PAGE_NETWORKS: Final = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
-#: … and names that do not exist on the Internet (RFC 6762, 8375; .internal is reserved by ICANN).
+#: … and names that do not exist on the Internet (RFC 6762, 8375; ICANN has reserved .internal).
 PAGE_NAMES: Final = ("localhost", "local", "lan", "internal", "home.arpa")
 _URN: Final = "urn:skyloop:"
 _CURVE: Final = ec.SECP256R1()
@@ -46,33 +46,33 @@ _SIGNED: Final = ec.ECDSA(hashes.SHA256())
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """A lab's authority; ``key`` is set only where identities are issued."""
+    """A lab's authority. ``key`` is set only where identities are issued."""
 
     certificate: x509.Certificate
     key: PrivateKey | None = None
 
     @property
     def name(self) -> str:
-        """Its name, for people."""
+        """The authority's name, for users."""
         return common_name(self.certificate)
 
     @property
     def expires(self) -> datetime:
-        """When its certificate expires, in UTC."""
+        """When the authority's certificate expires, in UTC."""
         return self.certificate.not_valid_after_utc
 
     def sign(self, content: bytes) -> bytes:
-        """Return a signature of content other than a certificate; needs the key."""
+        """Return a signature of content that is not a certificate; needs the key."""
         assert self.key is not None
         return self.key.sign(content, _SIGNED)
 
     def signed(self, content: bytes, signature: bytes) -> bool:
-        """Return whether a signature of content is this authority's."""
+        """Return whether a signature of content was made by this authority."""
         return signed_by(self.certificate, content, signature)
 
 
 def new_key() -> PrivateKey:
-    """Make a new private key on the curve P-256."""
+    """Create a new private key on the curve P-256."""
     return ec.generate_private_key(_CURVE)
 
 
@@ -89,7 +89,7 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Make a new lab's authority. Its name ends in random digits to tell labs apart."""
+    """Create the authority of a new lab. Its name ends in random digits to distinguish labs."""
     key = new_key()
     name = _name(f"Skyloop lab {secrets.token_hex(4)}")
     certificate = (
@@ -104,7 +104,7 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Make a certificate for an identity, signed by an authority with its key, valid no longer than the authority."""
+    """Create a certificate for an identity, signed with the authority's key and valid no longer than the authority."""
     assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
@@ -124,10 +124,10 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Make an authority for pages, separate from the lab's, that may certify only these names and all below them.
+    """Create an authority for pages, separate from the lab's, that may certify only these names and names below them.
 
-    Its certificates are valid for private addresses, names of local networks, and the given names: a browser that
-    trusts it trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
+    Its certificates are valid for private addresses, names on local networks, and the given names. A browser that
+    trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
     """
     key = new_key()
     name = _name(f"Skyloop pages {secrets.token_hex(4)}")
@@ -146,14 +146,14 @@ def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Autho
 def issue_page(
     authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Make a certificate for a cockpit's page.
+    """Create a certificate for a cockpit's page.
 
     Args:
-        authority: An authority for pages, with its key.
-        names: IP addresses and host names by which browsers reach it, at least one.
+        authority: The authority for pages, with its key.
+        names: IP addresses and host names by which browsers reach the page, at least one.
         key: The page's key.
-        until: Expiry in UTC, limited to that of the authority's certificate.
-        now: The time in UTC.
+        until: Expiry in UTC, but no later than that of the authority's certificate.
+        now: The current time in UTC.
     """
     assert authority.key is not None
     issuer = authority.certificate
@@ -170,7 +170,7 @@ def issue_page(
 
 
 def page_names(certificate: x509.Certificate) -> list[str]:
-    """Return the addresses and names in a page's certificate."""
+    """Return the addresses and names that a page's certificate contains."""
     found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     return [*map(str, found.get_values_for_type(x509.IPAddress)), *found.get_values_for_type(x509.DNSName)]
 
@@ -187,10 +187,10 @@ def may_certify(authority: Authority, name: str) -> bool:
 
 
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
-    """Decode a certificate from a file.
+    """Decode a certificate read from a file.
 
     Raises:
-        FileFormatError: It is not a certificate.
+        FileFormatError: The data are not a certificate.
     """
     try:
         return x509.load_pem_x509_certificate(content)
@@ -202,7 +202,7 @@ def read_der(content: bytes) -> x509.Certificate:
     """Decode a certificate received over the network.
 
     Raises:
-        DecodeError: It is not a certificate in DER.
+        DecodeError: The data are not a certificate in DER.
     """
     try:
         return x509.load_der_x509_certificate(content)
@@ -211,12 +211,12 @@ def read_der(content: bytes) -> x509.Certificate:
 
 
 def der(certificate: x509.Certificate) -> bytes:
-    """Encode a certificate for the network, in DER."""
+    """Encode a certificate in DER, for sending over the network."""
     return certificate.public_bytes(serialization.Encoding.DER)
 
 
 def sign(key: PrivateKey, content: bytes) -> bytes:
-    """Return a signature by an identity's key: ECDSA with SHA-256, in DER."""
+    """Sign content with an identity's key: ECDSA with SHA-256, in DER."""
     return key.sign(content, _SIGNED)
 
 
@@ -233,14 +233,14 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 
 
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Decode a private key from a file.
+    """Decode a private key read from a file.
 
     Raises:
-        FileFormatError: It is not a private key, or not on an elliptic curve.
+        FileFormatError: The data are not a private key on an elliptic curve.
     """
     try:
         key = serialization.load_pem_private_key(content, password=None)
-    except (ValueError, TypeError):  # TypeError: encrypted
+    except (ValueError, TypeError):  # TypeError is raised for an encrypted key
         raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
         raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
@@ -248,11 +248,11 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's; its key is None where nothing is issued.
+    """Check that a certificate is an authority's. Its key is None where nothing is issued.
 
     Raises:
-        FileFormatError: It is not an authority's certificate.
-        UsageError: The key does not belong to it.
+        FileFormatError: The certificate is not an authority's.
+        UsageError: The key does not belong to the certificate.
     """
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
@@ -269,7 +269,7 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
     """Return the identity in a certificate.
 
     Raises:
-        FileFormatError: It names no role and drones.
+        FileFormatError: It does not name a role and drones.
     """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -283,13 +283,13 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return the name used by access control; empty if the certificate has none or several."""
+    """Return the name that access control uses; empty if the certificate has none or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
 
 def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
-    """Return whether a certificate is for this key."""
+    """Return whether a certificate belongs to this key."""
     return key.public_key() == certificate.public_key()
 
 
@@ -308,10 +308,10 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
-    """Check that a certificate is valid now.
+    """Check that a certificate is currently valid.
 
     Raises:
-        UsageError: It is not valid yet, or has expired.
+        UsageError: The certificate is not valid yet, or has expired.
     """
     if now >= certificate.not_valid_after_utc:
         raise UsageError(f"{what} expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: issue a new one")
@@ -331,7 +331,7 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
 
 def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # checked by read_authority
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # verified by read_authority
     return public
 
 

@@ -1,13 +1,15 @@
-"""One identity's folder for use by a program: read, checked, watched for a newer roster; and the roster.
+"""Load and check an identity's folder for a program, watch it for a newer roster; encode and decode rosters.
 
-=================  ==================================================================== ``ca.pem``         the
-certificate of the lab's authority ``identity.pem``   the identity's certificate ``identity.key``   its private key:
-readable by its owner only ``roster.json``    all identities of the lab, signed; replace it when there is a newer one
-=================  ====================================================================
+================  ==============================================================================
+``ca.pem``        the certificate of the lab's authority
+``identity.pem``  the identity's certificate
+``identity.key``  its private key, readable by its owner only
+``roster.json``   all identities in the lab, signed; to be replaced by newer ones
+================  ==============================================================================
 
-Zenoh's access control identifies subjects by common name, so wherever it is enforced all names must be known. The
-roster file has two parts: the list itself, and a signature of exactly those bytes. Its number grows with each change,
-and the highest number is in force.
+Zenoh's access control identifies subjects by common name, so all names must be known wherever it is enforced. The
+roster file has two parts: the list itself, and a signature of exactly those bytes. Its number increases with each
+change, and the roster with the highest number applies.
 """
 
 from __future__ import annotations
@@ -39,38 +41,38 @@ from skyloop.network.keys.certificates import (
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
-_PURPOSE: Final = b"skyloop roster\n"  # prefix of all signed content, which no other signature has
+_PURPOSE: Final = b"skyloop roster\n"  # prefix of all content signed here; no other signature uses it
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
-NOTICE: Final = timedelta(days=7)  #: how early an expiry is announced
+NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """One identity. Times are whole seconds since 1970, UTC."""
+    """One identity. Times are whole seconds since 1970, in UTC."""
 
     name: str
     role: KeyRole
     drones: tuple[str, ...]
-    serial: str  #: of the newest certificate, hexadecimal
-    expires: int  #: expiry of that one
-    last: int  #: latest expiry of all certificates under this name
+    serial: str  #: serial number of the newest certificate, hexadecimal
+    expires: int  #: expiry of the newest certificate
+    last: int  #: latest expiry of all certificates issued under this name
     revoked: bool = False
 
     @property
     def identity(self) -> Identity:
-        """The entry's identity."""
+        """The identity described by the entry."""
         return Identity(self.name, self.role, self.drones)
 
     @property
     def expires_at(self) -> datetime:
-        """Expiry of its newest certificate, in UTC."""
+        """Expiry of the newest certificate, in UTC."""
         return datetime.fromtimestamp(self.expires, UTC)
 
     @property
     def last_at(self) -> datetime:
-        """Latest expiry of all certificates under this name, in UTC."""
+        """Latest expiry of all certificates issued under this name, in UTC."""
         return datetime.fromtimestamp(self.last, UTC)
 
 
@@ -83,19 +85,19 @@ class Roster(msgspec.Struct, frozen=True):
     format: int = FORMAT
 
     def find(self, name: str) -> Entry | None:
-        """Return the entry of a name; None if there is none."""
+        """Return the entry for a name, or None if there is none."""
         return next((entry for entry in self.entries if entry.name == name), None)
 
     @property
     def identities(self) -> list[Identity]:
-        """The identities that may join: all that were not revoked.
+        """The identities that may join: all that have not been revoked.
 
-        The handshake checks that their certificates are valid.
+        Whether their certificates are valid is checked in the handshake.
         """
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
-        """Return the next roster, with this entry replacing the one of its name."""
+        """Return the next roster, in which this entry replaces the one with the same name."""
         others = [other for other in self.entries if other.name != entry.name]
         entries = tuple(sorted([*others, entry], key=lambda each: each.name))
         return Roster(self.number + 1, self.lab, entries)
@@ -107,18 +109,18 @@ class _File(msgspec.Struct):
 
 
 def encode_roster(roster: Roster, authority: Authority) -> bytes:
-    """Return the signed roster file."""
+    """Return the content of the roster file, signed."""
     body = msgspec.json.format(msgspec.json.encode(roster), indent=1)
     signature = base64.b64encode(authority.sign(_PURPOSE + body)).decode()
     return msgspec.json.encode(_File(msgspec.Raw(body), signature)) + b"\n"
 
 
 def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
-    """Check a roster file's signature, then decode it.
+    """Check the signature of a roster file, then decode it.
 
     Raises:
-        FileFormatError: It is not a roster, is damaged, or has another format.
-        UsageError: It was changed, or another authority signed it.
+        FileFormatError: The file is not a roster, is damaged, or has an unknown format.
+        UsageError: The file was modified, or another authority signed it.
     """
     try:
         file = msgspec.json.decode(content, type=_File)
@@ -139,7 +141,7 @@ def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """A checked identity. The paths are absolute, as Zenoh reads the files itself."""
+    """A verified identity. Paths are absolute, because Zenoh reads the files itself."""
 
     identity: Identity
     expires: datetime
@@ -161,50 +163,50 @@ class Credentials:
 
     @property
     def authority_file(self) -> Path:
-        """The certificate of the lab's authority."""
+        """Path of the lab authority's certificate."""
         return self.directory / AUTHORITY_FILE
 
     @property
     def certificate_file(self) -> Path:
-        """The identity's certificate."""
+        """Path of the identity's certificate."""
         return self.directory / CERTIFICATE_FILE
 
     @property
     def key_file(self) -> Path:
-        """The identity's private key."""
+        """Path of the identity's private key."""
         return self.directory / KEY_FILE
 
     @property
     def roster_file(self) -> Path:
-        """The roster."""
+        """Path of the roster."""
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return what has expired or expires within a week: this key, or the lab's authority.
+        """Return what has expired or will expire within a week: this key, the lab's authority, or both.
 
         Returns:
-            A sentence for people for each, by subject.
+            A sentence for users about each, by subject.
         """
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster if the folder has one; else None.
+        """Return these credentials with a newer roster if the folder has one, otherwise None.
 
         Raises:
-            UsageError: The roster can't be read, or this lab's authority did not sign it.
+            UsageError: The roster can't be read, or was not signed by this lab's authority.
         """
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and check it completely.
+    """Read an identity's folder and verify all of it.
 
     Raises:
-        UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` for a file that is
-            damaged or of another kind. The message says how to fix it.
+        UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` if a file is damaged or
+            of the wrong kind. The message says how to fix it.
     """
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
@@ -225,10 +227,10 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the public certificate and roster in the folder of a lab or an identity.
+    """Read the public certificate and the roster from the folder of a lab or an identity.
 
     Raises:
-        UsageError: There is no such folder, or a file in it is missing or not valid.
+        UsageError: The folder does not exist, or a file in it is missing or invalid.
     """
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
@@ -237,7 +239,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_warning(what: str, end: datetime, now: datetime) -> str:
-    """Return a sentence for people if the expiry is past or less than a week away; empty if not."""
+    """Return a sentence for users if the expiry has passed or is less than a week away; otherwise an empty string."""
     left = end - now
     if left > NOTICE:
         return ""

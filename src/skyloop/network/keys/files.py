@@ -1,4 +1,4 @@
-"""Files that hold keys: access rights and atomic replacement."""
+"""Read and write files that hold keys: access rights and atomic replacement."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Final
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.files import read_bytes
 
-MAX_BYTES: Final = 16 << 20  #: of a file; a roster of 10 000 identities has 3 MB
+MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities has 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory that only its owner can enter, or check an existing one.
+    """Create a directory that only its owner can enter, or check an existing one.
 
     Raises:
-        UsageError: It can't be made, or is open to others.
+        UsageError: The directory can't be created, or is accessible to others.
     """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -33,10 +33,10 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file atomically; a private one is readable by its owner only, from its first byte on.
+    """Replace a file atomically. A private one is readable only by its owner, from the first byte on.
 
     Raises:
-        UsageError: It can't be written.
+        UsageError: The file can't be written.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -55,16 +55,16 @@ def read(path: Path, what: str) -> bytes:
     """Read a file of at most :data:`MAX_BYTES`.
 
     Raises:
-        UsageError: It can't be read, or is too large.
+        UsageError: The file can't be read, or is too large.
     """
     return read_bytes(path, what, MAX_BYTES)
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """Read a file that must not be open to others, who might have copied the key.
+    """Read a file that must not be accessible to others, because they might have copied the key.
 
     Raises:
-        UsageError: It can't be read, is too large, or is open to others.
+        UsageError: The file can't be read, is too large, or is accessible to others.
     """
     content = read(path, what)
     mode = path.stat().st_mode
@@ -78,12 +78,12 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a directory against changes by other processes, waiting for them to finish.
+    """Lock a directory against changes by other processes; wait while one of them holds the lock.
 
-    The kernel releases the lock with the process.
+    The kernel releases the lock when the process ends.
 
     Raises:
-        UnsupportedError: This platform has no such locks.
+        UnsupportedError: This platform does not support file locks.
     """
     try:
         import fcntl

@@ -1,4 +1,4 @@
-"""Identities on the network: a name, a role, and the drones it applies to."""
+"""Identities on the network: a name, a role, and the drones that the role applies to."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.errors import UsageError
 
-ANYONE: Final = "anyone"  #: name of all applications without a key, and so never a key's
+ANYONE: Final = "anyone"  #: name of all applications that have no key, and therefore never a key's name
 ALL_DRONES: Final = ("*",)
 MAX_PATTERNS: Final = 32
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
@@ -18,43 +18,43 @@ _PATTERN: Final = re.compile(r"[a-z0-9_.*-]{1,48}")
 
 
 class KeyRole(StrEnum):
-    """A key's role with respect to its identity's drones."""
+    """What a key permits with respect to its identity's drones."""
 
-    PILOT = "pilot"  #: sees every drone, and may fly its own
-    OBSERVER = "observer"  #: sees its drones, and flies none
-    PROXY = "proxy"  #: serves drones of these names
-    ROUTER = "router"  #: carries everybody's sealed traffic between networks: it may lose it, not read it
+    PILOT = "pilot"  #: may see every drone, and fly its own
+    OBSERVER = "observer"  #: may see its drones, but not fly any
+    PROXY = "proxy"  #: may serve drones with its names
+    ROUTER = "router"  #: forwards everyone's sealed traffic between networks; it could drop traffic, but not read it
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A name and its rights; ``drones`` are patterns where ``*`` matches any characters."""
+    """A name and its rights. ``drones`` are patterns in which ``*`` matches any characters."""
 
     name: str
     role: KeyRole
     drones: tuple[str, ...] = ALL_DRONES
 
     def covers(self, drone: str) -> bool:
-        """Return whether a drone of this name is among this identity's drones."""
+        """Return whether this identity's drones include one with this name."""
         return any(fnmatchcase(drone, pattern) for pattern in self.drones)
 
     def may_fly(self, drone: str) -> bool:
-        """Return whether this is a pilot of a drone of this name."""
+        """Return whether this is a pilot for a drone with this name."""
         return self.role is KeyRole.PILOT and self.covers(drone)
 
     def may_see(self, drone: str) -> bool:
-        """Return whether an application with these keys may see a drone of this name: a pilot sees all."""
+        """Return whether an application with these keys may see a drone with this name. A pilot may see all drones."""
         return self.role is KeyRole.PILOT or (self.role is KeyRole.OBSERVER and self.covers(drone))
 
     def may_serve(self, drone: str) -> bool:
-        """Return whether this is a proxy that may serve this name."""
+        """Return whether this is a proxy that may serve a drone with this name."""
         return self.role is KeyRole.PROXY and self.covers(drone)
 
     def require_proxy(self, drone: str) -> None:
-        """Check that this is a proxy that may serve a name.
+        """Check that this is a proxy that may serve a drone with this name.
 
         Raises:
-            UsageError: It is not.
+            UsageError: That is not the case.
         """
         if self.role is not KeyRole.PROXY:
             raise UsageError(f"these are the keys of {self}: a proxy needs keys of --role proxy")
@@ -65,7 +65,7 @@ class Identity:
         """Check that this is a router.
 
         Raises:
-            UsageError: It is not.
+            UsageError: That is not the case.
         """
         if self.role is not KeyRole.ROUTER:
             raise UsageError(f"these are the keys of {self}: a router needs keys of --role router")
@@ -74,7 +74,7 @@ class Identity:
         """Check that this is a pilot or an observer.
 
         Raises:
-            UsageError: It is not.
+            UsageError: That is not the case.
         """
         if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
             raise UsageError(f"these are the keys of {self}: an application needs a pilot's or an observer's")
@@ -84,15 +84,15 @@ class Identity:
 
 
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
-    """Make an identity from a person's input.
+    """Create an identity from user input.
 
     Args:
-        name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``; not ``anyone``.
-        role: One of :class:`KeyRole`.
-        drones: Names or patterns, separated by commas; ``*`` for a router.
+        name: 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``; not ``anyone``.
+        role: A value of :class:`KeyRole`.
+        drones: Names of drones or patterns, separated by commas; ``*`` for a router.
 
     Raises:
-        UsageError: One of them is not valid.
+        UsageError: One of the arguments is invalid.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -110,10 +110,10 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
 
 
 def parse_drones(text: str) -> tuple[str, ...]:
-    """Parse names of drones or patterns, separated by commas: ``alpha,bravo*``.
+    """Parse drone names or patterns separated by commas: ``alpha,bravo*``.
 
     Raises:
-        UsageError: A pattern is not valid, or there are more than :data:`MAX_PATTERNS`.
+        UsageError: A pattern is invalid, or there are more than :data:`MAX_PATTERNS`.
     """
     patterns = tuple(dict.fromkeys(re.sub(r"\*+", "*", part.strip()) for part in text.split(",")))
     for pattern in patterns:

@@ -1,18 +1,22 @@
-"""A lab's authority: the folder that issues and revokes identities; and certificates for cockpit pages.
+"""A lab's authority, a folder that issues and revokes identities; and certificates for cockpit pages.
 
-=====================  ===================================================================== ``ca.key``             the
-authority's private key: its holder can make any identity ``ca.pem``             its certificate ``roster.json``
-all identities, signed ``issued/NAME/``       one identity's folder, to copy to its machine =====================
-=====================================================================
+================  ========================================================================
+``ca.key``        the authority's private key: its holder can create any identity
+``ca.pem``        its certificate
+``roster.json``   all identities, signed
+``issued/NAME/``  one identity's folder, to be copied to its machine
+================  ========================================================================
 
-Pages have certificates because browsers decode video, and keep the screen on, only over https. They come from a
-separate authority, in a folder beside the lab's keys. Browsers are asked to trust it, and safely may: it can certify
-nothing beyond private networks. Its key gives no access to the lab's network, and the lab's none to pages.
+Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
+separate authority, in a folder next to the lab's keys. Users have their browsers trust it, which is safe because it
+can't certify anything beyond private networks. Its key gives no access to the lab's network, the lab's none to pages.
 
-=====================  ===================================================================== ``ca.pem``             the
-certificate for browsers to trust ``ca.key``             the authority's key ``page.pem``           the page's
-certificate, for the addresses and names of this machine ``page.key``           its key =====================
-=====================================================================
+============  ==========================================================================
+``ca.pem``    the certificate for browsers to trust
+``ca.key``    the authority's key
+``page.pem``  the page's certificate, for the addresses and names of this machine
+``page.key``  its key
+============  ==========================================================================
 """
 
 from __future__ import annotations
@@ -47,16 +51,16 @@ IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
-FOLDER: Final = "pages"  #: in the lab's folder
+FOLDER: Final = "pages"  #: name of the folder for pages within the lab's folder
 
 PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
-RENEWED_DAYS: Final = 60  #: the cockpit replaces a certificate with less left when it starts
+RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left
 
 
 class Lab:
     """An authority that can issue identities, created by :meth:`make` or opened by :meth:`open`.
 
-    Each change holds a lock on the folder, so that two processes lose none.
+    Each change is made under a lock on the folder, so that no change by another process is lost.
     """
 
     def __init__(self, directory: Path, authority: Authority) -> None:
@@ -65,15 +69,15 @@ class Lab:
 
     @classmethod
     def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
-        """Make a new authority in a separate folder.
+        """Create a new authority in a folder of its own.
 
         Args:
-            directory: The folder, made if it is missing.
+            directory: The folder, created if it does not exist.
             days: Validity of the authority, 1 to 36500.
-            now: The time in UTC; by default this machine's.
+            now: The current time in UTC; by default this machine's clock.
 
         Raises:
-            UsageError: The folder already has an authority or can't be used, or ``days`` is out of range.
+            UsageError: The folder already contains an authority or can't be used, or ``days`` is out of range.
         """
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
@@ -94,7 +98,7 @@ class Lab:
         """Open the authority in a folder.
 
         Raises:
-            UsageError: There is none, or a file is damaged.
+            UsageError: The folder contains no authority, or a file is damaged.
         """
         key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
         if not key_path.exists():
@@ -106,9 +110,9 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster now in the folder.
+        """The roster currently in the folder.
 
-        Reading it raises :class:`UsageError` if it can't be read or was changed.
+        Raises :class:`UsageError` if it can't be read or was modified.
         """
         path = self.directory / ROSTER_FILE
         return decode_roster(files.read(path, "the roster"), self.authority, path)
@@ -118,12 +122,12 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Make a new key and certificate for an identity, or renew them.
+        """Create a new key and certificate for an identity, or renew them.
 
         Args:
             identity: The holder.
-            days: Validity of the key, more than 0 and up to :data:`MAX_IDENTITY_DAYS`; shortened to the authority's.
-            now: The time in UTC; by default this machine's.
+            days: Validity of the key, more than 0 and at most :data:`MAX_IDENTITY_DAYS`; limited by the authority's.
+            now: The current time in UTC; by default this machine's clock.
 
         Raises:
             UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
@@ -152,9 +156,9 @@ class Lab:
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Revoke an identity, and delete its folder's files here.
+        """Revoke an identity and delete the files in its folder here.
 
-        It takes effect wherever the new roster has arrived.
+        The revocation takes effect wherever the new roster is installed.
 
         Raises:
             UnknownNameError: The roster has no such name.
@@ -176,7 +180,7 @@ class Lab:
     def _write_roster(self, roster: Roster) -> None:
         """Write the roster to the lab's folder and to those of all identities.
 
-        So each folder copied from now on has the newest.
+        Every folder copied from now on therefore has the newest one.
         """
         content = encode_roster(roster, self.authority)
         files.write(self.directory / ROSTER_FILE, content)
@@ -203,22 +207,22 @@ class PageFiles:
     certificate: Path
     key: Path
     authority: Path  #: the certificate for browsers to trust
-    left_out: tuple[str, ...] = ()  #: the machine's own names that the authority may not certify
+    left_out: tuple[str, ...] = ()  #: this machine's names that the authority may not certify
 
 
 def page_certificate(
     directory: Path, own: Sequence[str], wanted: Sequence[str] = (), now: datetime | None = None
 ) -> PageFiles:
-    """Return a certificate for a cockpit's page: the present one if it fits, else a new one.
+    """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
 
     Args:
-        directory: The folder, made if it is missing.
-        own: Addresses and names of this machine; those that the authority may not certify are left out.
-        wanted: Names given by people.
-        now: The time in UTC; by default this machine's.
+        directory: The folder, created if it does not exist.
+        own: This machine's addresses and names; those that the authority may not certify are left out.
+        wanted: Names given by the user.
+        now: The current time in UTC; by default this machine's clock.
 
     Raises:
-        UsageError: A name in ``wanted`` may not be certified, no name is left, or a file can't be used.
+        UsageError: A name in ``wanted`` may not be certified, no name remains, or a file can't be used.
         MissingExtraError: The extra ``network`` is not installed.
     """
     now = datetime.now(UTC) if now is None else now

@@ -1,1 +1,1 @@
-"""Analysis of recorded flights: tables of their samples, a summary, a report, exports, comparisons, and recovery."""
+"""Analyse recorded flights: tables of their samples, a summary, a report, exports, comparisons, and recovery."""

@@ -1,4 +1,4 @@
-"""A self-contained report page: style, script, data, and charts as SVG, coloured by the page's classes."""
+"""A self-contained report page with its style, script and data, and SVG charts coloured by the page's CSS classes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from skyloop.files import write
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 1120  #: width of all charts with a time axis; the page scales them
-LEFT: Final = 64  #: space for the labels of the vertical axis
+WIDTH: Final = 1120  #: width of all charts that have a time axis; the page scales them
+LEFT: Final = 64  #: left margin for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
-AXIS: Final = 20  #: space for the labels of the time axis
-BUCKETS: Final = 700  #: a line has at most twice as many points: minimum and maximum of each bucket
-GAP_FACTOR: Final = 8.0  #: a step longer than this many usual ones is a gap in the line
+AXIS: Final = 20  #: margin for the labels of the time axis
+BUCKETS: Final = 700  #: a line has at most twice this many points: the minimum and maximum in each bucket
+GAP_FACTOR: Final = 8.0  #: a step longer than this many typical ones leaves a gap in the line
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A series over time; NaN where unknown. ``style`` is the CSS class of its colour."""
+    """A data series over time, NaN where unknown. ``style`` is the CSS class that sets its colour."""
 
     label: str
     t_s: Floats
     values: Floats
     style: str = "c1"
     dashed: bool = False
-    steps: bool = False  #: draw steps: a value holds until the next one
+    steps: bool = False  #: draw steps: each value holds until the next one
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A named interval; ``style`` is the CSS class of its colour."""
+    """A named time interval. ``style`` is the CSS class that sets its colour."""
 
     begin_s: float
     end_s: float
@@ -51,7 +51,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A labelled moment; ``style`` is the CSS class of its colour."""
+    """A labelled moment. ``style`` is the CSS class that sets its colour."""
 
     t_s: float
     text: str
@@ -66,13 +66,13 @@ class TimeAxis:
     end_s: float
 
     def x(self, t_s: float) -> float:
-        """Return the coordinate of a time."""
+        """Return the horizontal coordinate of a time."""
         span = max(self.end_s - self.begin_s, 1e-9)
         return LEFT + (t_s - self.begin_s) / span * (WIDTH - LEFT - RIGHT)
 
 
 def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: float) -> list[Span]:
-    """Return the intervals of names with a style (``*`` is any other name); the last ends at ``end_s``."""
+    """Return the intervals between changes of name, with styles (``*``: any other name); the last ends at ``end_s``."""
     found: list[Span] = []
     if not len(t_s):
         return found
@@ -87,7 +87,7 @@ def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: f
 
 
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Return round numbers from low to high, at most ``most`` + 1, at 1, 2 or 5 times a power of ten."""
+    """Return round numbers from low to high, at most ``most`` + 1 of them, spaced 1, 2 or 5 times a power of ten."""
     if not high > low:
         return [low]
     raw = (high - low) / most
@@ -98,7 +98,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> tuple[float, float]:
-    """Return vertical limits at least ``least_span`` apart: all known values with a margin, and 0 if wanted."""
+    """Return vertical limits at least ``least_span`` apart: all known values plus a margin, including 0 if ``zero``."""
     known = [values for line in lines if (values := line.values[np.isfinite(line.values)]).size]
     if not known:
         return 0.0, least_span
@@ -113,7 +113,7 @@ def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> t
 
 
 def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, Floats]:
-    """Reduce points to at most two per bucket, minimum and maximum, so that no peak is lost."""
+    """Reduce points to at most two per bucket, its minimum and maximum, so that no peak is lost."""
     if len(t_s) <= 2 * buckets:
         return t_s, values
     keep: list[int] = []
@@ -127,7 +127,7 @@ def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, F
 
 
 def pieces(t_s: Floats, values: Floats) -> list[tuple[Floats, Floats]]:
-    """Return the stretches between gaps and unknown values."""
+    """Return the stretches of points between gaps and unknown values."""
     if not len(t_s):
         return []
     steps = np.diff(t_s)
@@ -145,7 +145,7 @@ def pieces(t_s: Floats, values: Floats) -> list[tuple[Floats, Floats]]:
 def time_chart(
     name: str, lines: Sequence[Line], axis: TimeAxis, y_limits: tuple[float, float], *, height: int = 130
 ) -> str:
-    """Draw lines over time, with the labels of the vertical axis."""
+    """Draw lines over time, with labels on the vertical axis."""
     low, high = y_limits
     bottom = height - AXIS
 
@@ -163,7 +163,7 @@ def time_chart(
 
 
 def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Sequence[Mark], axis: TimeAxis) -> str:
-    """Draw rows of named intervals, and below them a row of marks."""
+    """Draw rows of named intervals with a row of marks below."""
     each = 24
     height = TOP + each * (len(rows) + bool(marks)) + AXIS
     parts = [_grid(axis, height)]
@@ -194,7 +194,7 @@ def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Seq
 
 
 def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) -> str:
-    """Draw a path from above at equal scales, coloured by time, on a grid in metres."""
+    """Draw a path as seen from above, with equal scales, coloured by time, on a grid in metres."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y, t_s = x[known], y[known], t_s[known]
     half = max(float(np.ptp(x)), float(np.ptp(y)), 1.0) * 0.56
@@ -233,7 +233,7 @@ def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) 
 
 
 def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int = 48) -> str:
-    """Draw a path in pieces, from the colour of the start to that of the end."""
+    """Draw a path in pieces whose colours run from that of the start to that of the end."""
     if len(points) < 2:
         return ""
     span = max(float(t_s[-1] - t_s[0]), 1e-9)
@@ -298,7 +298,7 @@ def _number(value: float) -> str:
 
 
 class Page:
-    """Collects the parts of a page and the values shown at its cursor."""
+    """Collects the parts of a page and the values to show at its cursor."""
 
     def __init__(self, title: str, axis: TimeAxis) -> None:
         self._title = title
@@ -322,7 +322,7 @@ class Page:
         )
 
     def way(self, t_s: Floats, x: Floats, y: Floats) -> None:
-        """Make the cursor show the position on the map."""
+        """Show the position on the map at the cursor."""
         step = max(1, len(t_s) // 2000)
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 
@@ -362,13 +362,13 @@ _FILES = ("page.css", "page.js")
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return figures side by side as HTML."""
+    """Format figures side by side as HTML."""
     cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in pairs)
     return f'<dl class="facts">{cells}</dl>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], classes: Sequence[str]) -> str:
-    """Return a table as HTML with unescaped cells; class ``n`` marks a column of numbers."""
+    """Format a table as HTML. Cells are not escaped; class ``n`` marks a column of numbers."""
     titles = "".join(f'<th class="{kind}">{escape(title)}</th>' for title, kind in zip(head, classes, strict=True))
     lines = "".join(
         "<tr>" + "".join(f'<td class="{kind}">{cell}</td>' for cell, kind in zip(row, classes, strict=True)) + "</tr>"
@@ -386,5 +386,5 @@ def _legend(lines: Sequence[Line]) -> str:
 
 
 def _numbers(values: Floats) -> list[float | None]:
-    """Round values to visible precision; unknown ones become None."""
+    """Round values to the precision that is visible; unknown values become None."""
     return [round(number, 4) if math.isfinite(number) else None for number in values.tolist()]

@@ -1,4 +1,4 @@
-"""Compare two recordings' commands over time, to see what a changed controller does differently; as a page or image."""
+"""Compare the commands of two recordings over time, to show what a changed controller does differently."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.charts import Line, Mark, Page, TimeAxis, band_chart, facts, limits, spans, table
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
-RATE_HZ: Final = 100.0  #: rate of the comparison; a command holds until the next one
-PART: Final = 0.01  #: greatest difference of set-points that count as equal, in their SI unit
+RATE_HZ: Final = 100.0  #: sampling rate of the comparison; a command holds until the next one
+PART: Final = 0.01  #: maximum difference at which two set-points count as equal, in their SI unit
 _POSITION: Final = "replay.position_s"
 _UNITS: Final = {
     **dict.fromkeys(("roll", "pitch", "yaw"), "rad"),
@@ -33,14 +33,14 @@ What = Literal["asked", "applied"]
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """One recording's commands: actions, and their values, NaN where an action has none of that name."""
+    """The commands of one recording: actions and their values, NaN where an action has no value with that name."""
 
     times_s: NDArray[np.float64]
     names: NDArray[np.str_]
     numbers: dict[str, NDArray[np.float64]]
 
     def at(self, times_s: NDArray[np.float64]) -> Commands:
-        """Return the commands in effect at some times [s]; none before the first."""
+        """Return the commands in effect at the given times [s]; there are none before the first."""
         index = np.searchsorted(self.times_s, times_s, side="right") - 1
         before = index < 0
         index = np.maximum(index, 0)
@@ -54,27 +54,27 @@ class Commands:
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
-    """The difference of one set-point value, over the time when both have it."""
+    """The difference in one set-point value, over the time when both recordings have it."""
 
     name: str
     unit: str
     rms: float
     largest: float
     largest_at_s: float
-    seconds: float  #: time during which both have it
+    seconds: float  #: time during which both recordings have it
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two flights' commands on one time axis that starts with the older recording."""
+    """The commands of two flights on one time axis, which starts with the older recording."""
 
     aligned: str  #: how the times are aligned, in words
     old: Commands
     new: Commands
-    seconds: float  #: compared time
-    same_action: float  #: share of that time with the same kind of action in both
+    seconds: float  #: duration of the compared part
+    same_action: float  #: fraction of that duration with the same kind of action in both
     fields: tuple[FieldDifference, ...]
-    part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None: never
+    part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None if none
     counts: tuple[int, int]
 
 
@@ -86,16 +86,16 @@ def compare(
     what: What = "asked",
     part: float = PART,
 ) -> Comparison:
-    """Compare the commands requested by applications (or those applied), without the proxies' own.
+    """Compare the commands that applications requested (or those applied), excluding the proxies' own.
 
-    A recording of a replay maps its times to the old flight; otherwise both recordings start at their first command.
+    The times of a recorded replay are mapped to the old flight; otherwise the first commands are aligned.
 
     Args:
         old: The older recording.
         new: The newer one.
-        drone: The drone's name; None takes each recording's first.
+        drone: The drone's name; None selects the first in each recording.
         what: ``"asked"`` or ``"applied"``.
-        part: Greatest difference of set-points that count as equal, in their SI unit.
+        part: Maximum difference at which two set-points count as equal, in their SI unit.
 
     Raises:
         FileFormatError: A recording has no commands.
@@ -142,7 +142,7 @@ def compare(
 
 
 def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset_ns: int) -> Commands:
-    """Return a recording's commands; ``offset_ns`` converts its times to the old recording's."""
+    """Return a recording's commands; ``offset_ns`` converts its times to those of the old recording."""
     times, names = [], []
     numbers: dict[str, list[float]] = {name: [] for name in ACTION_FIELDS}
     for item in recording.items(drone, (Channel.COMMANDS,)):
@@ -164,7 +164,7 @@ def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset
 
 
 def _align(old: Recording, old_name: str, new: Recording, new_name: str) -> tuple[int, str, int]:
-    """Return the old recording's start, how the times fit, and the offset to add to the new one's times [ns]."""
+    """Return the old recording's start, how times are aligned, and the offset [ns] to add to the new one's times."""
     zero_ns = begin_ns(old, old_name)
     spans = [_span(recording, name) for recording, name in ((old, old_name), (new, new_name))]
     overlap = min(span[1] for span in spans) - max(span[0] for span in spans)
@@ -183,7 +183,7 @@ def _align(old: Recording, old_name: str, new: Recording, new_name: str) -> tupl
 
 
 def _span(recording: Recording, drone: str) -> tuple[int, int]:
-    """Return the times of the first and last command, on the proxy's clock [ns]."""
+    """Return the times of the first and last commands, on the proxy's clock [ns]."""
     times = [item.value.applied_ns for item in recording.items(drone, (Channel.COMMANDS,))]
     return (min(times), max(times)) if times else (0, 0)
 
@@ -205,7 +205,7 @@ _NEW: Final[dict[str, Any]] = {"color": "#d9480f", "lw": 1.4, "ls": "--"}
 
 
 def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
-    """Write the comparison of two named recordings as ``.html``, or with Matplotlib as ``.png``.
+    """Write the comparison of two named recordings as ``.html``, or as ``.png`` (with Matplotlib).
 
     Raises:
         UsageError: The file can't be written.
@@ -218,7 +218,7 @@ def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
 
 
 def make_page(found: Comparison, old: str, new: str) -> Page:
-    """Create the page: actions, each set-point of both recordings, and a table of the differences."""
+    """Create the page: actions, each set-point from both recordings, and a table of differences."""
     axis = _axis(found)
     page = Page(f"{new} against {old}", axis)
     page.add(f"<h1>{escape(Path(new).name)} against {escape(Path(old).name)}</h1>")

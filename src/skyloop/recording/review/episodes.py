@@ -1,6 +1,6 @@
-"""Flights of a recording as episodes for learning: rows at a steady rate, each with observation and action.
+"""Convert recorded flights to episodes for learning: rows at a steady rate, each with an observation and an action.
 
-Everything but the video is computed from a recording's tables.
+Everything except the video is computed from a recording's tables.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import Table
 from skyloop.recording.review.video import even
 
-MARK: Final = "mark"  #: name of a logged text that starts another episode and names its task
-TAUGHT: Final = "action"  #: name of logged arrays: the taught action for an image
+MARK: Final = "mark"  #: name of a logged text that starts a new episode and names its task
+TAUGHT: Final = "action"  #: name of logged arrays that hold the demonstrated action for an image
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
-_GAP_S: Final = 0.5  #: an episode ends after this long without an image or a state
+_GAP_S: Final = 0.5  #: an episode ends if no image or no state arrives for this long
 _SHORTEST_S: Final = 1.0  # shorter episodes are left out
 
 Floats = NDArray[np.float64]
@@ -38,12 +38,12 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """The columns of each row.
+    """Defines the columns of each row.
 
     Attributes:
-        state: Names of the state's numbers, from :data:`~skyloop.messages.rows.STATE`.
-        set_point: Kind of the commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`.
-        cameras: Cameras whose images a row has.
+        state: Names of the numbers in the state, from :data:`~skyloop.messages.rows.STATE`.
+        set_point: Kind of commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`.
+        cameras: Cameras whose images each row includes.
         fps: Rows per second.
     """
 
@@ -54,19 +54,19 @@ class Form:
 
     @property
     def action(self) -> tuple[str, ...]:
-        """Names of the action's numbers."""
+        """Names of the numbers in the action."""
         return ACTIONS[self.set_point]
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One flight, or a part of it marked by the application.
+    """One flight, or a part of one marked by the application.
 
     Attributes:
         task: The task, in words.
-        state: State at the capture of the first camera's image, shape (rows, len(form.state)), float64.
-        action: Action taught, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
-        frames_ns: Capture of each row's image by camera, on the proxy's clock, shape (rows,).
+        state: State when the first camera's image was captured, shape (rows, len(form.state)), float64.
+        action: Action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
+        frames_ns: Capture time of each row's image by camera, on the proxy's clock, shape (rows,).
     """
 
     task: str
@@ -80,11 +80,11 @@ class Episode:
 
 
 def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
-    """Return the columns available in each row of a recording.
+    """Return the columns that every row of a recording can have.
 
     Raises:
         FileFormatError: The recording has no feedback, no set-points, or no frames of a camera.
-        UsageError: It was flown by several kinds of set-points, or by positions.
+        UsageError: It was flown with several kinds of set-points, or with positions.
     """
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
@@ -109,21 +109,21 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     """Cut a recording into episodes.
 
     An episode lasts while the drone follows set-points without a gap in images or state, and is cut at marks. Its rows
-    are ``1 / form.fps`` apart. Each has the newest image of every camera, the state at the first camera's capture, and
-    the set-point in effect when the next row begins: the reaction to that image. Hovering is a set-point of zeros. If
-    an application logs arrays named ``action``, they are the actions instead: each row has the first one at or after
-    its image's capture, and a gap in them ends an episode.
+    are ``1 / form.fps`` apart. Each has the newest image from every camera, the state at the first camera's capture
+    time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering counts as
+    a set-point of zeros. If an application logs arrays named ``action``, these are used as the actions instead: each
+    row has the first one at or after its image's capture, and a gap in them ends an episode.
 
     Args:
         tables: Tables of one drone.
-        form: Columns of each row.
-        task: The task where no mark names one.
+        form: Columns that each row has.
+        task: Name of the task where no mark gives one.
 
     Returns:
         The episodes that last at least a second.
 
     Raises:
-        FileFormatError: A logged action's number of values differs from the form's set-points.
+        FileFormatError: A logged action has a different number of values than the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -160,13 +160,13 @@ def _times(table: Table, column: str) -> Times:
 
 
 def _piloted(commands: Table) -> NDArray[np.bool_]:
-    """Return which commands came from an application rather than the proxy."""
+    """Return which commands came from an application rather than from the proxy."""
     given: NDArray[np.bool_] = commands.numbers("app_id") > 0
     return given
 
 
 def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
-    """Return times and values of the logged actions; None if there are none."""
+    """Return times and values of the logged actions, or None if there are none."""
     if logs is None or "values" not in logs.columns:
         return None
     kept = (logs["name"] == TAUGHT) & (logs["values"] != "")
@@ -184,12 +184,12 @@ def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
 
 
 def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, int, str]]:
-    """Return start, end [ns] and task of each stretch that follows set-points, cut at marks."""
+    """Return start [ns], end [ns] and task of each stretch in which the drone follows set-points, cut at marks."""
     times, steered = _times(feedback, "captured_ns"), np.isin(feedback["state"], _STEERED)
     marks: list[tuple[int, str]] = []
     if logs is not None and "text" in logs.columns:
         marked = (logs["name"] == MARK) & (logs["text"] != "")
-        # A table's times are relative; a mark is in the file where it was received, between two states.
+        # Times in a table are relative, and a mark is stored where it was received, between two states.
         for t_s, text in zip(logs.numbers("t_s")[marked], logs["text"][marked], strict=True):
             marks.append((int(np.interp(t_s, feedback.numbers("t_s"), times)), str(text)))
     parts = []
@@ -208,13 +208,13 @@ def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, in
 
 
 def _runs(good: NDArray[np.bool_]) -> list[slice]:
-    """Return the stretches of true values."""
+    """Return the stretches of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(np.int8)))
     return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
-    """Return the state at times, interpolated: angles the shorter way around."""
+    """Return the state interpolated at the given times, with angles going the shorter way around."""
     times = _times(feedback, "captured_ns")
     columns = []
     for name in form.state:
@@ -227,7 +227,7 @@ def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
 
 
 def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
-    """Return the set-point in effect at times; zeros before the first and while hovering."""
+    """Return the set-point in effect at the given times; zeros before the first one and while hovering."""
     kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
     times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]
     values = np.stack([np.nan_to_num(commands.numbers(f"asked_{name}")[kept]) for name in form.action], axis=1)
@@ -242,21 +242,21 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: images between key frames: training reads them in any order
-_LOOKED_AT_EVERY: Final = 16  #: rows sampled for the statistics
-_THINNED: Final = 4  #: sampled images use every fourth row and column
+_KEY_EVERY: Final = 2  #: images between key frames: training reads images in any order
+_LOOKED_AT_EVERY: Final = 16  #: one in this many rows is sampled for the statistics
+_THINNED: Final = 4  #: only every fourth row and column of a sampled image is used
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's images of all episodes at a steady rate: H.264 in an MP4 file that exists once closed without error.
+    """One camera's images from all episodes at a steady rate, in an H.264 MP4 file, which an error removes.
 
     Attributes:
-        width: Width of the images [px]; 0 before the first.
+        width: Width of the images [px]; 0 until the first is added.
         height: Height of the images [px].
-        repeated: Number of rows whose image could not be decoded and repeats the one before.
+        repeated: Number of rows that repeat the previous image because theirs could not be decoded.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -281,18 +281,18 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the file; remove it after an error."""
+        """Complete the file, or remove it after an error."""
         if kind is None and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._opened.__exit__(kind, error, trace)
 
     def add(self, recording: Recording, drone: str, camera: str, wanted_ns: Sequence[Times]) -> None:
-        """Encode the images of a recording's rows, given by their captures, episode by episode.
+        """Encode the images for a recording's rows, given by their capture times, episode by episode.
 
         Raises:
             FileFormatError: The first image can't be decoded.
-            UsageError: An image's size differs from the first.
-            MissingExtraError: OpenCV, or a PyAV with x264, is not installed.
+            UsageError: An image differs in size from the first.
+            MissingExtraError: OpenCV, or PyAV with x264, is not installed.
         """
         wanted = np.concatenate([np.empty(0, np.int64), *wanted_ns])
         at = 0
@@ -312,14 +312,14 @@ class Film:
             while at < len(wanted) and wanted[at] <= captured_ns:
                 self._encode(image, recording.path)
                 at += 1
-        for _ in wanted[at:]:  # their images are missing at the end of a truncated file
+        for _ in wanted[at:]:  # images missing at the end of a truncated file
             if image is None:
                 raise FileFormatError(f"{recording.path}: no image of {camera} can be decoded")
             self.repeated += 1
             self._encode(image, recording.path)
 
     def stats(self) -> dict[str, Any]:
-        """Return minimum, maximum, mean, deviation and quantiles of each channel: red, green, blue, 0 to 1."""
+        """Return minimum, maximum, mean, deviation and quantiles of the red, green and blue channels, 0 to 1."""
         pixels = np.concatenate([image.reshape(-1, 3) for image in self._looked_at])[:, ::-1] / 255.0
         found = numbers_stats(pixels)
         return {name: [self._rows] if name == "count" else [[[v]] for v in value] for name, value in found.items()}
@@ -354,7 +354,7 @@ class Film:
 
 
 def numbers_stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Return a dataset's statistics of a column, each a list: one value, or one per number of a row."""
+    """Return a dataset's statistics for a column, as lists with one value for each number in a row."""
     columns = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
     found |= {name: np.quantile(columns, share, axis=0) for name, share in _QUANTILES.items()}

@@ -1,7 +1,7 @@
-"""Export of recorded flights as a LeRobotDataset, version 3.0.
+"""Export recorded flights as a LeRobotDataset, version 3.0.
 
-The layout is https://huggingface.co/docs/lerobot/lerobot-dataset-v3: one Parquet file of rows, one video per camera,
-and their description in ``meta/``.
+The layout follows https://huggingface.co/docs/lerobot/lerobot-dataset-v3: one Parquet file with the rows, one video per
+camera, and their description in ``meta/``.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ class Exported:
     form: Form
     episodes: int
     rows: int
-    repeated: int  #: images that could not be decoded and repeat the one before
+    repeated: int  #: number of images that could not be decoded and repeat the previous one
 
 
 @dataclass(slots=True)
 class _Flights:
-    """The episodes of one recording."""
+    """The episodes in one recording."""
 
     recording: Recording
     drone: str
@@ -71,25 +71,25 @@ def export_lerobot(
     task: str = "",
     doing: Doing | None = None,
 ) -> Exported:
-    """Write flights as episodes of a LeRobotDataset.
+    """Export flights as episodes of a LeRobotDataset.
 
-    An episode lasts while the drone follows set-points; a logged text named ``mark`` starts another and names its task.
-    :func:`skyloop.recording.review.episodes.episodes` describes the rows.
+    An episode lasts while the drone follows set-points; a logged text named ``mark`` starts a new one and names its
+    task. :func:`skyloop.recording.review.episodes.episodes` describes the rows.
 
     Args:
-        recordings: Recordings of drones flown alike.
-        folder: Folder of the dataset; it must be new or empty.
-        drone: The drone's name in each recording; None: each one's first.
-        cameras: Cameras to export; None: all of the first recording.
+        recordings: Recordings of similar drones flown in the same way.
+        folder: Folder for the dataset; it must be new or empty.
+        drone: The drone's name in each recording; None selects the first in each.
+        cameras: Cameras to export; None selects all cameras of the first recording.
         fps: Rows per second.
-        task: The task where no mark names one.
-        doing: Called with progress.
+        task: Name of the task where no mark gives one.
+        doing: Called to report progress.
 
     Raises:
         UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of
             range.
         UnknownNameError: A recording has no such drone.
-        FileFormatError: A recording has no feedback, set-points or frames, or none has an episode.
+        FileFormatError: A recording has no feedback, set-points or frames, or no recording has an episode.
         MissingExtraError: PyArrow, PyAV or OpenCV is not installed.
     """
     doing = doing or (lambda *_: None)
@@ -175,7 +175,7 @@ def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[st
 
 
 def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
-    """Return each episode's rows and part of each video."""
+    """Return each episode's rows and its part of each video."""
     ends = np.cumsum([len(episode) for episode in whole])
     begins = ends - [len(episode) for episode in whole]
     zeros = np.zeros(len(whole), np.int64)
@@ -263,7 +263,7 @@ class _Writer:
             raise UsageError(f"{self._folder} can't be created: {error.strerror}") from error
 
     def table(self, name: str, columns: Mapping[str, Any], metadata: dict[str, str] | None = None) -> None:
-        """Write columns; those of shape (rows, n) as lists."""
+        """Write columns; columns of shape (rows, n) are written as lists."""
         pa = self._pa
         arrays = {}
         for column, values in columns.items():
@@ -275,7 +275,7 @@ class _Writer:
             self._pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), part)
 
     def tasks(self, tasks: Sequence[str]) -> None:
-        """Write the tasks as the index of a Pandas frame, as readers expect."""
+        """Write the tasks as the index of a Pandas frame, which is what readers expect."""
         columns = {"task_index": np.arange(len(tasks)), "task": list(tasks)}
         kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
         described = [

@@ -1,4 +1,4 @@
-"""The report of a flight: one page with its path, its charts over time, key frames and events."""
+"""Create the report of a flight: one page with its path, charts over time, key frames and events."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ _FAILSAFES: Final = {"none": "", "*": "alarm"}
 _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
-_MOST_EVENTS: Final = 500  # listed on the page
-_LONGEST_STEP_S: Final = 0.5  #: over a longer step a velocity is not integrated
+_MOST_EVENTS: Final = 500  # maximum number of events listed on the page
+_LONGEST_STEP_S: Final = 0.5  #: velocity is not integrated across a longer step
 _WIDTH: Final = 360  #: width of a thumbnail [px]
 _QUALITY: Final = 80  # JPEG quality of thumbnails
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: share of the usual spacing: skip an evenly spaced frame this close to one at an event
-_SAME_CLOCK_S: Final = 60.0  #: skip longer delays: the two clocks are unrelated
+_NEAR: Final = 0.4  #: fraction of the usual spacing: skip an evenly spaced frame that is this close to one at an event
+_SAME_CLOCK_S: Final = 60.0  #: skip longer delays, because the two clocks must be unrelated
 
 
 def write_report(
     recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
 ) -> None:
-    """Write the report with at most ``pictures`` key frames per camera, reading the recording three times.
+    """Write the report with up to ``pictures`` key frames per camera. This reads the recording three times.
 
     Raises:
         UsageError: The file can't be written.
@@ -80,7 +80,7 @@ def write_report(
 
 
 def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
-    """Create the page's head, the path and the charts over time."""
+    """Create the head of the page, the path and the charts over time."""
     ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)
@@ -155,7 +155,7 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
 def _charts(
     recording: Recording, drone: str, found: dict[str, Table]
 ) -> Iterator[tuple[str, str, list[Line], float, bool]]:
-    """Yield title, unit, lines, least span of the vertical axis, and whether it starts at zero."""
+    """Yield title, unit, lines, minimum span of the vertical axis, and whether that axis includes 0."""
     feedback, commands = found.get("feedback"), found.get("commands")
     if feedback is not None:
         t_s = feedback.numbers("t_s")
@@ -191,7 +191,7 @@ def _charts(
 
 
 def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool = False) -> list[Line]:
-    """Return the applied values of set-points that have them."""
+    """Return the applied values of all set-points that have any."""
     if commands is None:
         return []
     found = []
@@ -204,14 +204,14 @@ def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool =
 
 
 def _turned(yaw: Floats) -> Floats:
-    """Convert yaw to degrees, with a gap where it wraps around."""
+    """Convert yaw to degrees, leaving a gap where it wraps around."""
     degrees = np.degrees(yaw)
     jumps = np.abs(np.diff(degrees, prepend=degrees[:1])) > 180.0
     return np.where(jumps, np.nan, degrees)
 
 
 def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterator[Line]:
-    """Yield delays from capture to recorder, and of commands from sending to applying [ms]."""
+    """Yield the delays [ms] of samples from capture to recorder, and of commands from sending to applying."""
     offset_ns = recording.drone(drone).clock_offset_ns
     colours = iter(_COLOURS)
     for name, samples in found.items():
@@ -228,14 +228,14 @@ def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterat
 
 
 def _clipped(line: Line) -> Line:
-    """Clip a line at its 99.5th percentile: one late sample must not flatten all others."""
+    """Clip a line at its 99.5th percentile, so that one late sample does not flatten all others."""
     if not len(line.values):
         return line
     return Line(line.label, line.t_s, np.minimum(line.values, np.percentile(line.values, 99.5) * 1.05), line.style)
 
 
 def _logged(logs: Table | None) -> Iterator[Line]:
-    """Yield the named series of numbers, at most six."""
+    """Yield the logged series of numbers, at most six."""
     if logs is None or "number" not in logs.columns:
         return
     numbers = logs.numbers("number")
@@ -298,12 +298,12 @@ def _channels(page: Page, summary: Summary) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """The path of the drone in world axes: x east, y north [m]."""
+    """The drone's path in world axes: x east, y north [m]."""
 
     t_s: Floats
     x: Floats
     y: Floats
-    source: str  #: source of the path, in words
+    source: str  #: where the path comes from, in words
 
     @property
     def length_m(self) -> float:
@@ -312,9 +312,9 @@ class Way:
 
 
 def way_of(feedback: Table) -> Way | None:
-    """Return the path of the drone; None if unknown.
+    """Return the drone's path, or None if it is unknown.
 
-    Taken from the vehicle's position, else the simulator's true one, else the integrated velocity.
+    Uses the vehicle's position if there is one, otherwise the simulator's true one, otherwise the integrated velocity.
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
@@ -352,7 +352,7 @@ def airborne_s(feedback: Table) -> float:
 def flight_facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """Return the known figures at the head of a report: name and value."""
+    """Return the figures that are known for the head of a report, as names and values."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
@@ -379,7 +379,7 @@ def flight_facts(
 
 
 def moments(first_s: float, last_s: float, events: Table | None, most: int) -> list[tuple[float, str]]:
-    """Select times to show, in order, each with its reason: up to half at events, the others evenly spaced. Pure."""
+    """Select times to show, sorted, each with its reason: up to half at events, the rest evenly spaced. Pure."""
     if most < 1 or last_s < first_s:
         return []
     chosen: list[tuple[float, str]] = []
@@ -401,7 +401,7 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
 
 
 def figures(recording: Recording, drone: str, camera: str, frames: Table, events: Table | None, most: int) -> list[str]:
-    """Return thumbnails as HTML, each of the first frame at or after its moment."""
+    """Return thumbnails as HTML, each showing the first frame at or after its moment."""
     t_s, seq = frames.numbers("t_s"), frames["seq"]
     wanted: dict[int, tuple[float, str]] = {}
     for moment, why in moments(float(t_s[0]), float(t_s[-1]), events, most):
@@ -430,7 +430,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    Unscaled if it can't be scaled here; empty if damaged, or if it is H.264 that can't be decoded here.
+    It has full size if it can't be scaled here; it is empty if damaged, or if it is H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

@@ -1,4 +1,4 @@
-"""Summarise a recording: counts, rates, gaps, drops and delays by channel; find damage, and recover a damaged file."""
+"""Summarise a recording: counts, rates, gaps, drops and delays by channel; detect damage, and recover damaged files."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from skyloop.recording.scan import Message, Scan, Schema, attachments, open_file
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-GAP_FACTOR: Final = 3.0  #: a step between two messages longer than this many usual ones is a gap
-MIN_STEPS: Final = 5  #: with fewer, the usual step is unknown
+GAP_FACTOR: Final = 3.0  #: a step between two messages counts as a gap if it is longer than this many typical steps
+MIN_STEPS: Final = 5  #: with fewer steps, the typical step is unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """Statistics of the time between two stamps of a sample [s]."""
+    """Statistics on the time between two timestamps of a sample [s]."""
 
-    what: str  #: the two stamps, in words
+    what: str  #: the two timestamps, in words
     median_s: float
     p99_s: float
 
@@ -40,10 +40,10 @@ class Row:
     topic: str
     schema: str
     count: int
-    rate_hz: float | None  #: None for a single message, or several at the same time
-    gaps: int  #: steps longer than three usual ones; steady channels only
+    rate_hz: float | None  #: None if there is only one message, or if all have the same time
+    gaps: int  #: steps longer than three typical ones; counted in steady channels only
     longest_s: float | None  #: longest step between two messages [s]
-    missing: int  #: messages missing by gaps in the samples' own numbers
+    missing: int  #: messages missing according to gaps in the samples' own numbers
     bytes: int
     steady: bool  #: whether messages arrive at a steady rate, so that rate and gaps are meaningful
     delays: tuple[Delay, ...] = ()
@@ -57,13 +57,13 @@ class Summary:
     seconds: float
     dropped: dict[str, dict[str, int]]  #: samples dropped by the recorder, by drone and channel
     missed: dict[str, dict[str, int]]  #: samples that never reached the recorder, by drone and channel
-    events: dict[str, int]  #: number by severity
-    notes: tuple[str, ...] = ()  #: problems of the file, in words
+    events: dict[str, int]  #: number of events by severity
+    notes: tuple[str, ...] = ()  #: problems with the file, in words
 
 
 @dataclass(slots=True)
 class _Tally:
-    """The data gathered of one channel."""
+    """The data gathered for one channel."""
 
     bytes: int = 0
     times: list[int] = field(default_factory=list)
@@ -79,7 +79,7 @@ _STEADY: Final = frozenset({Channel.FEEDBACK, Channel.COMMANDS, Channel.FRAMES})
 
 
 def summarise(recording: Recording, progress: Progress | None = None) -> Summary:
-    """Compute the statistics of a recording, reading all of it once."""
+    """Compute the statistics of a recording, reading it once from start to end."""
     series = {one.topic: one for one in recording.series}
     tallies: dict[str, _Tally] = {topic: _Tally() for topic in series}
     severities: dict[str, int] = {}
@@ -112,7 +112,7 @@ def summarise(recording: Recording, progress: Progress | None = None) -> Summary
 
 
 def notes(recording: Recording) -> list[str]:
-    """Describe the problems of the file."""
+    """Describe the problems with the file."""
     found = []
     if recording.cut:
         found.append(f"cut off: {recording.cut} (skyloop log recover repairs it)")
@@ -122,7 +122,7 @@ def notes(recording: Recording) -> list[str]:
 
 
 def _measure(tally: _Tally, value: Any, received_ns: int) -> None:
-    """Note numbers and delays of one sample; ``received_ns`` is on the proxy's clock."""
+    """Record the numbers and delays of one sample; ``received_ns`` is on the proxy's clock."""
     if isinstance(value, Feedback):
         tally.numbers.append(value.seq)
         tally.delay("capture to proxy", value.published_ns - value.captured_ns)
@@ -163,7 +163,7 @@ def _row(topic: str, tally: _Tally, series: dict[str, Any]) -> Row:
 
 
 def _missing(numbers: list[int]) -> int:
-    """Count missing numbers of a sequence that grows by one; a number that is not higher restarts it."""
+    """Count the numbers missing from a sequence that increases by one; a number that is not higher restarts it."""
     steps = np.diff(np.array(numbers, np.int64))
     return int((steps[steps > 1] - 1).sum())
 
@@ -179,19 +179,19 @@ class Recovered:
     messages: dict[str, int]  #: number of messages by topic
     seconds: float
     size: int  #: size of the new file [bytes]
-    lost: int  #: greatest number of bytes of the old file that could not be read
-    why: tuple[str, ...]  #: problems of the old file
+    lost: int  #: upper limit for the number of bytes in the old file that could not be read
+    why: tuple[str, ...]  #: problems with the old file
 
 
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
-    """Read every byte of a recording and describe its problems; empty if it is intact."""
+    """Read every byte of a recording and describe its problems; return nothing if it is intact."""
     for _ in recording.entries(progress=progress):
-        pass  # reading checks the checksums
+        pass  # reading verifies the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 
 def recover(recording: Recording, target: Path, progress: Progress | None = None) -> Recovered:
-    """Write everything readable to a new file, which appears only when complete.
+    """Write everything that is readable to a new file, which appears only once it is complete.
 
     Raises:
         UsageError: ``target`` already exists, or can't be written.
@@ -210,7 +210,7 @@ def recover(recording: Recording, target: Path, progress: Progress | None = None
 
 
 def _copy(found: Scan, writer: Writer, progress: Progress | None) -> tuple[dict[str, int], int]:
-    """Return messages by topic, and the bytes of completely read pieces."""
+    """Return the number of messages by topic, and the bytes in pieces that were read completely."""
     writer.start(PROFILE, "skyloop log recover")
     for record in found.metadata:
         writer.add_metadata(record.name, record.metadata)

@@ -1,4 +1,4 @@
-"""The samples of one drone as columns, the basis of reports and comparisons; and their export to files."""
+"""Convert one drone's samples to columns, the basis of reports and comparisons, and export them to files."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord, ResultRecord
 from skyloop.recording.plain import Course
 from skyloop.recording.reader import Item, Progress, Recording
 
-#: Columns of the components of feedback's vectors, in order.
+#: Column names for the components of feedback's vectors, in order.
 VECTORS: Final[dict[str, tuple[str, str, str]]] = {
     "velocity_m_s": ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"),
     "angular_velocity_rad_s": ("angular_velocity_x_rad_s", "angular_velocity_y_rad_s", "angular_velocity_z_rad_s"),
     "acceleration_m_s2": ("acceleration_x_m_s2", "acceleration_y_m_s2", "acceleration_z_m_s2"),
     "position_m": ("position_x_m", "position_y_m", "position_z_m"),
 }
-#: The values that an action can have, in the order of the columns.
+#: All values that actions can have, in column order.
 ACTION_FIELDS: Final = (
     *("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate"),
     *("x", "y", "z", "yaw", "speed", "turn_rate"),
 )
-_ABSURD: Final = 1e30  #: greatest value in any unit: its square, and a sum of many, must not overflow
+_ABSURD: Final = 1e30  #: maximum value in any unit: its square, and sums of many of these, must not overflow
 Cell = float | int | str | bool | None
 
 
 @dataclass(slots=True)
 class Table:
-    """Columns of equal length, of numbers (NaN: unknown) or strings (empty: unknown).
+    """Columns of equal length that hold numbers (NaN: unknown) or strings (empty: unknown).
 
-    ``t_s`` is the time since the recording's first sample [s], on the proxy's clock; other times are in ns.
+    ``t_s`` is the time since the recording's first sample [s] on the proxy's clock; all other times are in ns.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Table:
         return self.columns[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
-        """Return a column as floats; NaN where it does not exist, and for absurdly large numbers."""
+        """Return a column as floats, with NaN for absurdly large numbers, or all NaN if there is no such column."""
         found = self.columns.get(column)
         if found is None:
             return np.full(len(self), np.nan)
@@ -76,7 +76,7 @@ class Table:
 
 
 class _Builder:
-    """Collects rows whose columns become known as they arrive."""
+    """Collects rows whose columns are discovered as they arrive."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -99,7 +99,7 @@ class _Builder:
 
 
 def _array(cells: list[Cell]) -> NDArray[Any]:
-    """Return integers if all cells are, floats if all are numbers, else strings."""
+    """Convert cells to integers if they all are, to floats if they are all numbers, otherwise to strings."""
     kinds = {type(cell) for cell in cells}
     if kinds <= {int}:
         return np.array(cells, np.int64)
@@ -116,7 +116,7 @@ def tables(
     channels: Collection[Channel] = tuple(Channel),
     progress: Progress | None = None,
 ) -> dict[str, Table]:
-    """Read the tables of a drone, by name (``feedback``, ``frames.CAMERA`` …) in the order of the channels."""
+    """Read a drone's tables, keyed by name (``feedback``, ``frames.CAMERA`` …), in channel order."""
     builders: dict[str, _Builder] = {}
     for item, at_ns, first_ns in timed(recording, drone, channels, progress):
         name = item.channel.value + (f".{item.camera}" if item.camera else "")
@@ -132,9 +132,9 @@ def tables(
 def timed(
     recording: Recording, drone: str, channels: Collection[Channel], progress: Progress | None = None
 ) -> Iterator[tuple[Item, int, int]]:
-    """Yield samples with their time and that of the recording's first sample, on the proxy's clock [ns].
+    """Yield samples with their own time and that of the recording's first sample, both on the proxy's clock [ns].
 
-    The first sample is taken from all channels, so that the tables of several calls share their start.
+    The first sample is determined over all channels, so that tables from several calls have the same start.
     """
     first_ns = begin_ns(recording, drone)
     course = Course()
@@ -143,7 +143,7 @@ def timed(
 
 
 def begin_ns(recording: Recording, drone: str) -> int:
-    """Return the time of the first sample with a time, on the proxy's clock [ns]; 0 if none has one."""
+    """Return the time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
     course = Course()
     for item in recording.items(drone):
         course.follow(item.value)
@@ -153,7 +153,7 @@ def begin_ns(recording: Recording, drone: str) -> int:
 
 
 def row(item: Item) -> dict[str, Cell]:
-    """Convert a sample to cells by column name."""
+    """Convert a sample to cells, keyed by column name."""
     value = item.value
     cells: dict[str, Cell]
     if isinstance(value, Feedback):
@@ -216,13 +216,13 @@ def _action(prefix: str, action: AnyAction) -> dict[str, Cell]:
 
 
 def _flat(value: Any) -> Cell:
-    """Return a value with parts as JSON."""
+    """Convert a composite value to JSON."""
     cell: Cell = msgspec.json.encode(value).decode() if isinstance(value, list | dict) else value
     return cell
 
 
 def _cell(value: Any) -> Cell:
-    """Return tuples as text, numbers separated by spaces."""
+    """Convert a tuple to text, with its numbers separated by spaces."""
     if isinstance(value, tuple | list):
         return " ".join(f"{number:.9g}" for number in value)
     cell: Cell = value
@@ -232,18 +232,18 @@ def _cell(value: Any) -> Cell:
 # Files ----------------------------------------------------------------------------------------------------------
 
 
-#: Channels exported as tables; frames are listed with their times.
+#: Channels exported as tables; for frames, their times are listed.
 TABLES: Final = tuple(Channel)
-_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #: first characters of formulas
+_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #: characters that start a formula
 _NUMBER: Final = r"[-+]?(?:[0-9.]+(?:e[-+]?[0-9]+)?|inf|nan)"
 _NUMBERS: Final = re.compile(rf"{_NUMBER}(?: {_NUMBER})*")
 
 
 def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
-    """Write ``CHANNEL.csv`` for each table: UTF-8, comma, a header line; unknown values are empty.
+    """Write ``CHANNEL.csv`` for each table: UTF-8, comma-separated, with a header line; unknown values are empty.
 
-    A text that a spreadsheet would take for a formula gets a leading apostrophe, because applications, and the authors
-    of the file, choose such texts.
+    Text that a spreadsheet would take for a formula gets a leading apostrophe, because it may have been chosen by an
+    application or by the author of the file.
     """
     _make_folder(folder)
     written = []
@@ -281,7 +281,7 @@ def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
-    """Write one compressed ``.npz`` (the path gets that ending) with an array ``CHANNEL/COLUMN`` for each column."""
+    """Write a compressed ``.npz`` (a suffix added to the path) with an array ``CHANNEL/COLUMN`` for each column."""
     arrays = {f"{name}/{column}": values for name, table in found.items() for column, values in table.columns.items()}
     path = path if path.suffix == ".npz" else path.with_suffix(".npz")
     with replacing(path) as part:
@@ -304,7 +304,7 @@ def read(
 
 
 def _nulls(table: Table) -> dict[str, Any]:
-    """Return columns with None for unknown values."""
+    """Return columns with None in place of unknown values."""
     return {
         name: [cell or None for cell in values.tolist()] if values.dtype.kind == "U" else values
         for name, values in table.columns.items()
@@ -318,7 +318,7 @@ def _text(cell: Any) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Prefix a text that a spreadsheet would take for a formula with an apostrophe; leave numbers alone."""
+    """Prefix text that a spreadsheet would take for a formula with an apostrophe; leave numbers unchanged."""
     return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
 
 

@@ -1,4 +1,4 @@
-"""Export a camera's frames to MP4: H.264 copied as recorded, anything else encoded."""
+"""Export a camera's frames to MP4. H.264 is copied as recorded; anything else is encoded."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
-_TIME_BASE: Final = Fraction(1, 60_000)  #: each image keeps its own time; MPEG-4 allows at most 65535
-_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first one in this PyAV is used
+_TIME_BASE: Final = Fraction(1, 60_000)  #: each image keeps its own timestamp; MPEG-4 allows at most 65535
+_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: by preference; the first one in this PyAV build is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class Videos:
     """The result of an export."""
 
     videos: tuple[Video, ...]
-    left_out: int  #: frames that are damaged, depend on missing ones, or (when encoding) have another size
+    left_out: int  #: frames that are damaged, depend on missing ones, or (when encoding) differ in size
 
     @property
     def frames(self) -> int:
-        """Frames of all videos."""
+        """Number of frames in all videos."""
         return sum(video.frames for video in self.videos)
 
 
@@ -53,18 +53,18 @@ def export_mp4(
 ) -> Videos:
     """Write one camera's frames as a video with their capture times.
 
-    H.264 is copied as recorded, without decoding, if nothing is drawn into the frames. If its size or another parameter
-    changes, a new file starts: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing ones are left out.
-    Everything else is encoded into one file, without damaged frames and frames whose size differs from the first.
+    H.264 is copied as recorded, without decoding, if nothing is drawn on the frames. If its size or another parameter
+    changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing ones are left out.
+    Everything else is encoded into one file, leaving out damaged frames and those whose size differs from the first.
 
     Args:
         recording: The recording.
         drone: The drone's name.
         camera: The camera's name.
-        path: The file.
-        burn_time: Whether to draw the time since the recording's start into a corner of each frame.
-        encode: Whether to re-encode H.264, too.
-        progress: Called with the share read so far, 0 to 1.
+        path: The file to write.
+        burn_time: Whether to draw the time since the recording's start in a corner of each frame.
+        encode: Whether to re-encode even H.264.
+        progress: Called with the fraction read so far, 0 to 1.
 
     Raises:
         UnknownNameError: The recording has no such drone or camera.
@@ -73,14 +73,14 @@ def export_mp4(
         UsageError: The file can't be written.
     """
     require_pyav("exporting MP4")
-    recording.pictures(drone, camera)  # raises for an unknown name
+    recording.pictures(drone, camera)  # raises if a name is unknown
     if burn_time or encode or has_images(recording, drone, camera):
         return _encoded(recording, drone, camera, path, burn_time, progress)
     return _copied(recording, drone, camera, path, progress)
 
 
 def has_images(recording: Recording, drone: str, camera: str) -> bool:
-    """Return whether at least some frames of a camera were recorded as JPEG or PNG."""
+    """Return whether any of a camera's frames were recorded as JPEG or PNG."""
     images = image_topic(drone, camera)
     return any(series.topic == images for series in recording.series)
 
@@ -108,7 +108,7 @@ def _encoded(
 
     begin = begin_ns(recording, drone) if burn_time else None
     left_out = 0
-    # PyAV would open the file only with the first frame, and raise its own kinds of errors.
+    # PyAV would open the file only at the first frame, and raise exceptions of its own.
     with replacing(path) as part:
         with part.open("wb") as file, av.open(file, "w", format="mp4") as container:
             encoder = _Encoder(container, begin)
@@ -121,17 +121,17 @@ def _encoded(
 
 
 def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Decode frames: yield the capture time [ns] and the image, or None if it can't be decoded."""
+    """Decode frames; yield the capture time [ns] and the image, or None if it can't be decoded."""
     for picture in pictures:
         try:
             image = even(picture.pixels())
         except FileFormatError:
-            image = None  # skip a damaged frame; the others keep their times
+            image = None  # skip a damaged frame; the others keep their timestamps
         yield picture.header.captured_ns, image
 
 
 class _Encoder:
-    """Encodes frames of the first frame's size, and burns in the time since ``begin_ns`` (None: no time)."""
+    """Encodes frames of the same size as the first, with the time since ``begin_ns`` drawn on them (None: no time)."""
 
     def __init__(self, container: Any, begin_ns: int | None) -> None:
         self._container = container
@@ -142,13 +142,13 @@ class _Encoder:
         self._frames = 0
 
     def add(self, image: NDArray[np.uint8], captured_ns: int) -> bool:
-        """Encode a frame; return False, and skip it, if its size differs."""
+        """Encode a frame, or skip it and return False if its size differs."""
         import av
 
         if self._stream is None:
             self._stream, self._first_ns = _stream(av, self._container, image), captured_ns
         if image.shape[:2] != (self._stream.height, self._stream.width):
-            return False  # the camera switched to another size, but a video has only one
+            return False  # the camera switched to another size, but a video can have only one
         if self._begin_ns is not None:
             _burn(image, (captured_ns - self._begin_ns) / NS_PER_S)
         self._stamp = max(self._stamp + 1, round((captured_ns - self._first_ns) / NS_PER_S / _TIME_BASE))
@@ -159,7 +159,7 @@ class _Encoder:
         return True
 
     def close(self, path: Path) -> Video | None:
-        """Encode the waiting frames; return the video, or None if it is empty."""
+        """Encode the remaining frames and return the video, or None if it is empty."""
         stream = self._stream
         if stream is None:
             return None
@@ -185,7 +185,7 @@ def _stream(av: Any, container: Any, image: NDArray[np.uint8]) -> Any:
 
 
 def even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image without an odd last row or column, as video codecs require."""
+    """Drop an odd last row or column of an image, because video codecs need even sizes."""
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
     return np.ascontiguousarray(image[:height, :width])
 
@@ -211,34 +211,34 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 # Copying --------------------------------------------------------------------------------------------------------
 
 
-TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual video clock
-MAX_FILES: Final = 50  #: encode a stream that changes more often instead
-_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step: 31 bits hold less than seven hours
-_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration of the last image
+TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual one for video
+MAX_FILES: Final = 50  #: a stream that would need more files is encoded instead
+_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames: 31 bits hold less than seven hours
+_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration given to the last image
 
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A written video."""
+    """A video that was written."""
 
     path: Path
     frames: int
-    begin_s: float  #: capture of its first frame, relative to the first video's
+    begin_s: float  #: capture time of its first frame, relative to the first video's
     width: int
     height: int
-    copied: bool  #: whether the frames are the vehicle's own encoding
+    copied: bool  #: whether the frames are in the vehicle's own encoding
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
     """The contents of an access unit."""
 
-    parameters: bytes  #: sequence and picture parameter sets in Annex B form; empty unless it has both
-    is_picture: bool  #: whether it has a slice of a picture
+    parameters: bytes  #: sequence and picture parameter sets in Annex B format; empty unless it has both
+    is_picture: bool  #: whether it contains a slice of a picture
 
 
 def contents(unit: bytes) -> Contents:
-    """Parse an access unit in Annex B form. Pure. ITU-T H.264, 7.3.1 and 7.4.1."""
+    """Parse an access unit in Annex B format. Pure. See ITU-T H.264, 7.3.1 and 7.4.1."""
     found = units(unit)
     kinds = {unit_type(one) for one in found}
     sets = [one for one in found if unit_type(one) in (SPS, PPS)] if {SPS, PPS} <= kinds else []
@@ -246,23 +246,23 @@ def contents(unit: bytes) -> Contents:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """Return a video's file name: ``film.mp4``, then ``film-2.mp4`` and so on."""
+    """Return the path of a numbered video: ``film.mp4``, then ``film-2.mp4`` and so on."""
     return path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 class TooManyChangesError(FileFormatError):
-    """The stream changes too often to write a file for each part."""
+    """Raised when the stream changes too often to write a file for each part."""
 
 
 class StreamCopy:
-    """Writes one camera's frames, in order, to a video, and to another one when the stream changes.
+    """Copies one camera's frames, passed in order, to a video, and starts a new one when the stream changes.
 
-    A stream changes with its parameter sets: MP4 has one of them, at its start. Frames that can't be decoded, and those
-    up to the next key frame, are left out; the frame before them stays on screen until then.
+    The stream changes when its parameter sets do: an MP4 file has only one set, at its start. A frame that can't be
+    decoded and all frames up to the next key frame are left out; the frame before them stays on screen until then.
 
     Args:
         path: The first file.
-        opened: Closes the files, which only then get their final names.
+        opened: Closes the files, which get their final names only at that point.
     """
 
     def __init__(self, path: Path, opened: ExitStack) -> None:
@@ -297,7 +297,7 @@ class StreamCopy:
             file.close()
 
     def _file_for(self, picture: Picture) -> _File | None:
-        """Return the file for a frame; None if the frame can't be decoded."""
+        """Return the file to write a frame to, or None if the frame can't be decoded."""
         key = picture.record.key
         if not picture.can_be_decoded or not (key or self._whole):
             return None
@@ -307,7 +307,7 @@ class StreamCopy:
         if not key:
             return self._file
         if not found.parameters:
-            return None  # a key frame without them can't be decoded
+            return None  # a key frame without parameter sets can't be decoded
         if self._file is None or self._file.parameters != found.parameters:
             template = _template(picture.compressed)
             if template is None:
@@ -329,7 +329,7 @@ class StreamCopy:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """The stream parameters of a key frame."""
+    """The stream parameters read from a key frame."""
 
     stream: Any  # a PyAV stream
     width: int
@@ -338,10 +338,10 @@ class _Template:
 
 
 def _template(key: bytes) -> _Template | None:
-    """Have FFmpeg read a key frame's parameter sets; None if it can't."""
+    """Have FFmpeg read the parameter sets of a key frame; return None if it can't."""
     import av
 
-    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # a damaged size must not make it allocate gigabytes
+    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # so that a corrupted size can't make it allocate gigabytes
     try:
         container = av.open(BytesIO(key), format="h264", stream_options=limits)
     except (av.error.FFmpegError, ValueError):
@@ -366,7 +366,7 @@ class _File:
         self.parameters = parameters
         self.width, self.height = template.width, template.height
         self.frames = 0
-        # PyAV would open the file only with the first frame, and raise its own kinds of errors.
+        # PyAV would open the file only at the first frame, and raise exceptions of its own.
         self._target = opened.enter_context(part.open("wb"))
         self._container: Any = opened.enter_context(av.open(self._target, "w", format="mp4"))
         self._stream = self._container.add_stream_from_template(template.stream)
@@ -376,7 +376,7 @@ class _File:
         self._shortened = 0
 
     def write(self, unit: bytes, captured_ns: int, *, key: bool) -> None:
-        """Append a frame; replace a time not later than the previous one by the next possible time."""
+        """Append a frame. If its time is not later than the previous one's, use the next possible time."""
         import av
 
         packet: Any = av.Packet(unit)
@@ -386,7 +386,7 @@ class _File:
             self._shortened += stamp - self._stamp - _LONGEST_STEP
             stamp = self._stamp + _LONGEST_STEP
         packet.pts = packet.dts = self._stamp = stamp
-        packet.duration = _USUAL_STEP  # only for the last frame: others end with the next one
+        packet.duration = _USUAL_STEP  # applies only to the last frame: the others end when the next one starts
         packet.time_base, packet.stream, packet.is_keyframe = TIME_BASE, self._stream, key
         self._container.mux(packet)
         self.frames += 1
