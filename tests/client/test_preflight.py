@@ -172,7 +172,7 @@ def test_an_autopilot_that_watches_another_computer_says_so() -> None:
     found = {one.what: one for one in ArduCopterProfile().safety_diagnostics({"MAV_GCS_SYSID": 42.0}, own_system=255)}
     net = lines(with_parameters(vehicle__checkup=encode_checkup([found["ground station"]])))["ground station"]
     assert (net.level, net.why, net.remedy) == (
-        Level.WARN, "it won't detect our loss", "give the address ?own_sysid=42"
+        Level.WARN, "it won't notice our loss", "give the address ?own_sysid=42"
     )  # fmt: skip
     assert "ground station" not in {
         one.what for one in ArduCopterProfile().safety_diagnostics({"MAV_GCS_SYSID": 255.0}, own_system=255)

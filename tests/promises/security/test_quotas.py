@@ -76,7 +76,7 @@ def test_one_key_does_not_take_all_places(rig: Rig, olga: Intruder) -> None:
         return [event.text for event in rig.bench.published(EventKind.COMMAND_REFUSED) if "olga" in event.text]
 
     wait_until(told, "it is told")
-    assert f"may have {PER_KEY}" in told()[0]
+    assert f"already has {PER_KEY}" in told()[0]
 
 
 def test_thousands_of_signs_of_life_hide_no_drone(rig: Rig) -> None:
