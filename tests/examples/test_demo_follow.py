@@ -72,7 +72,7 @@ def test_the_table_shows_known_and_unknown_figures() -> None:
 
     assert "no one was found" in shown(FollowReport("detector", 4.0))
     report = FollowReport("detector", 4.0, target="anna", frames=10, in_view=10, found=9, errors_m=[0.1, -0.3, 0.1])
-    for words in ("anna, by detector", "100.0% of 10 frames", "90.0%", "median 4.10 m, wanted 4 m; off by 0.10 m"):
+    for words in ("anna, by detector", "100.0% of 10 frames", "90.0%", "median 4.10 m, desired 4 m; off by 0.10 m"):
         assert words in shown(report)
 
 
