@@ -125,4 +125,4 @@ def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.Monke
     ended = run("stop", "alpha")
     assert ended.code == 0
     assert ended.out.startswith("alpha: motors off")
-    assert asked == ["Cut the motors of alpha? What flies FALLS."]
+    assert asked == ["Cut the motors of alpha? Flying drones FALL."]

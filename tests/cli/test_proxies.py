@@ -154,7 +154,7 @@ def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:
     ("words", "said"),
     [
         (["simm://"], "no vehicle driver named 'simm'; did you mean 'sim'?"),
-        (["sim"], "'sim' is not a vehicle's address: it looks like sim://"),
+        (["sim"], "'sim' is not a vehicle's address, such as sim://"),
         (["sim://?wurld=room"], "no option of sim:// named 'wurld'; did you mean 'world'?"),
         (["sim://?seed=x"], "option seed is 'x' and must be a number"),
         (["sim://?cameras=none", "--name", "Bad Name"], "'Bad Name' cannot be the name of a proxy"),
