@@ -203,7 +203,7 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
 
         def follows() -> bool:  # tap again if the panel had moved with the person before the finger came down
             nonlocal tapped_s
-            if "Tracked" in page.says(".follow-phase") and time.monotonic() - tapped_s > 4.0:
+            if "Tracking" in page.says(".follow-phase") and time.monotonic() - tapped_s > 4.0:
                 tapped_s = time.monotonic()
                 panel.get_by_role("button", name="Follow").tap()
             return "following" in page.says(".follow-phase")
