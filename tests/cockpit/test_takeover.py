@@ -108,7 +108,7 @@ def test_a_higher_priority_gets_control_when_the_time_is_up(client: TestClient, 
             assert question(pilot)["left_s"] <= 0.5
             if answers:
                 pilot.say("answer", id=drone.app_id, grant=False)
-            assert pilot.wait("authority", mine=False)["holder"] == "survey.py"
+            pilot.wait("authority", mine=False, holder="survey.py")
             assert {"type": "asked", "questions": []} in pilot.told
 
 
