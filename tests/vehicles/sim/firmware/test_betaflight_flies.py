@@ -176,8 +176,14 @@ def test_another_flies_in_a_separate_network(start: Callable[..., Process], tmp_
         assert places[0] is not None
         assert places[1] is not None
         assert abs(places[0][0] - places[1][0]) > 0.5, "each gets its own position"
-        one.config["msp.aux3"] = 2000
-        eventually(lambda: flags(one) == "PARALYZE", "one has its reason", PATIENCE_S)
+
+        def paralyzed() -> bool:  # Betaflight accepts that switch only once it was off, 5 s or more after its start
+            for width_us in (1000, 2000):
+                one.config["msp.aux3"] = width_us
+                time.sleep(0.3)
+            return flags(one) == "PARALYZE"
+
+        eventually(paralyzed, "one has its reason", PATIENCE_S)
         assert flags(two) == "", "the other has none"
     assert all(process_in(folder) for folder in folders)
     several.signal(signal.SIGKILL)
