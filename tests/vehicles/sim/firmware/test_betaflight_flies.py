@@ -48,6 +48,14 @@ def flags(drone: skyloop.Drone) -> str:
     return str((drone.feedback().native or {}).get("arming.flags", "none known"))
 
 
+def is_paralyzed(drone: skyloop.Drone) -> bool:
+    """Switch PARALYZE off and on, which Betaflight accepts only once it was off 5 s or more after its start."""
+    for width_us in (1000, 2000):
+        drone.config["msp.aux3"] = width_us
+        time.sleep(0.3)
+    return flags(drone) == "PARALYZE"
+
+
 def height_m(drone: skyloop.Drone) -> float:
     return float(str((drone.feedback().native or {})["truth.z"]))
 
@@ -110,8 +118,7 @@ def test_it_follows_the_marker_and_is_safe_without_link_pilot_or_firmware(
 
 
 def _is_refused_by_name(drone: skyloop.Drone) -> None:
-    drone.config["msp.aux3"] = 2000  # until its restart
-    eventually(lambda: flags(drone) == "PARALYZE", "it has its reason", PATIENCE_S)
+    eventually(lambda: is_paralyzed(drone), "it has its reason, until its restart", PATIENCE_S)
     with pytest.raises(RefusedError, match="the flight controller refuses to arm: PARALYZE"):
         drone.takeoff(timeout_s=PATIENCE_S)
     assert drone.feedback().state is FlightState.LANDED
@@ -176,14 +183,7 @@ def test_another_flies_in_a_separate_network(start: Callable[..., Process], tmp_
         assert places[0] is not None
         assert places[1] is not None
         assert abs(places[0][0] - places[1][0]) > 0.5, "each gets its own position"
-
-        def paralyzed() -> bool:  # Betaflight accepts that switch only once it was off, 5 s or more after its start
-            for width_us in (1000, 2000):
-                one.config["msp.aux3"] = width_us
-                time.sleep(0.3)
-            return flags(one) == "PARALYZE"
-
-        eventually(paralyzed, "one has its reason", PATIENCE_S)
+        eventually(lambda: is_paralyzed(one), "one has its reason", PATIENCE_S)
         assert flags(two) == "", "the other has none"
     assert all(process_in(folder) for folder in folders)
     several.signal(signal.SIGKILL)
