@@ -385,6 +385,7 @@ class FlightSupervisor:
         """Update the holder, the failsafe's step and the flight's owner in feedback."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
+        waiting = authority.waiting
         self._publisher.stamp(
             {
                 "owner": name_of(self._sessions, owner.app_id) if owner is not None else None,
@@ -395,7 +396,7 @@ class FlightSupervisor:
                 "others": flight.others if flight.whose is Whose.OTHERS else None,
                 "start_position_m": self._returns.start,
                 "return_phase": self._returns.phase,
-                "next_owner": next((name_of(self._sessions, one.app_id) for one in authority.waiting), None),
+                "next_owner": name_of(self._sessions, waiting[0].app_id) if waiting else None,
             }
         )
 
