@@ -269,8 +269,8 @@ def test_a_person_is_called_as_the_page_says_unless_the_login_has_a_name(client:
     with page(client, name="Anna\x1b[31m  Lee") as anna, page(client) as other:
         assert anna.take(8).told[-1]["app"].startswith("Anna[31m Lee (cockpit ")
         other.wait("authority", holder=anna.told[-1]["app"])
-    assert Person(Role.PILOT, "ann").called("Boss") == "ann"
-    assert Person(Role.PILOT).called("x" * 100) == "x" * 40
+    assert Person(Role.PILOT, "ann").display_name("Boss") == "ann"
+    assert Person(Role.PILOT).display_name("x" * 100) == "x" * 40
 
 
 def test_a_closed_page_leaves_the_line(client: TestClient, node: Node) -> None:

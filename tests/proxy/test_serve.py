@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 from skyloop.clock import monotonic_ns
-from skyloop.errors import UsageError
+from skyloop.errors import DriverError, UsageError
 from skyloop.messages import EventKind, Takeoff
+from skyloop.proxy import Proxy
 from skyloop.proxy.serve import run, serve
-from skyloop.transport.local import dial
+from skyloop.transport.local import LocalServer, dial
 from tests.proxy.toy_process import Toy
 from tests.support.proxy_bench import WAIT_S, App
 
@@ -61,6 +62,26 @@ def flying() -> App:
 def rest_of(process: subprocess.Popen[str]) -> list[str]:
     out, _ = process.communicate(timeout=WAIT_S)
     return out.splitlines()
+
+
+def test_a_vehicle_in_flight_is_landed_if_another_cannot_be_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A flight that the first proxy had found, or begun, was left in the air."""
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+    first, second = (Proxy(Toy(monotonic_ns), LocalServer(name), name=name) for name in ("toy", "other"))
+    apps: list[App] = []
+
+    def start() -> None:
+        apps.append(flying())
+        raise DriverError("the port is in use")
+
+    monkeypatch.setattr(second, "start", start)
+    with pytest.raises(DriverError, match="in use"):
+        run([first, second], records=False)
+    told = capsys.readouterr().out.splitlines()
+    assert [line for line in told if line.startswith("told")] == ["told takeoff", "told land"]
+    apps[0].end.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

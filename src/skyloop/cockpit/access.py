@@ -56,7 +56,7 @@ _LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of these tables
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
 
-MOST_NAME: Final = 40  #: maximum length of a name that a person asks for
+MAX_NAME: Final = 40  #: maximum length of a name that a person asks for
 _log = logging.getLogger(__name__)
 
 
@@ -119,9 +119,9 @@ class Person:
         """Return whether this person has the permissions of a role: a pilot may also observe."""
         return self.role is Role.PILOT or role is Role.OBSERVER
 
-    def called(self, wish: str) -> str:
-        """Return the name shown to others; ``wish`` is used only for people without a name of their own."""
-        return self.name or " ".join("".join(filter(str.isprintable, wish)).split())[:MOST_NAME]
+    def display_name(self, requested: str) -> str:
+        """Return the name shown to others; ``requested`` is used only for people without a name of their own."""
+        return self.name or " ".join("".join(filter(str.isprintable, requested)).split())[:MAX_NAME]
 
 
 class Gate(Protocol):

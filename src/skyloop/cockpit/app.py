@@ -233,7 +233,7 @@ class Cockpit:
             await socket.close(NOT_ALLOWED, "only a pilot may do this")
             return
         photos = self._recordings.folder / "photos"
-        name = person.called(socket.query_params.get("name", ""))
+        name = person.display_name(socket.query_params.get("name", ""))
         await ControlSession(socket, station, name, photos=photos, follower=self._follower).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:

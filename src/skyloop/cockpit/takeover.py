@@ -225,11 +225,11 @@ class AuthorityReport:
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
-        heir: str | None = None  # the first in the queue, which may be a program
+        next_owner: str | None = None  # the first in the queue, which may be a program
         try:
             feedback = self._station.feedback()
             holder, priority = self._station.view.holder(feedback), feedback.owner_priority
-            heir = feedback.next_owner
+            next_owner = feedback.next_owner
         except LinkError:
             holder, priority = None, None
         mine = state == "held"
@@ -246,10 +246,11 @@ class AuthorityReport:
             self._given = False  # the handover was at another time, or the other application did not accept
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
-        waiting = sorted(session.app for session in self._station.sessions if session.waits)
-        # Of the pages it is known here first.
-        if heir is not None and not lost and heir not in {session.app for session in self._station.sessions}:
-            waiting.insert(0, heir)
+        sessions = self._station.sessions
+        waiting = sorted(session.app for session in sessions if session.waits)
+        # A page's own request is known here before feedback reports it.
+        if next_owner is not None and not lost and all(session.app != next_owner for session in sessions):
+            waiting.insert(0, next_owner)
         if (state, holder, priority, place, why, waiting) == self._sent:
             return None
         self._sent = state, holder, priority, place, why, waiting

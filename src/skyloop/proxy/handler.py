@@ -295,7 +295,7 @@ class CommandHandler(FlightSupervisor):
         self._report_intent(session)
         applied_ns = self._count_applied(command)
         ladder = self.ladder
-        if not (ladder.idle or checks.goes_on(kind, seen, automatic=automatic)):
+        if not (ladder.idle or checks.keeps_failsafe(kind, seen, automatic=automatic)):
             self._events.publish_drafts(*self._apply_failsafe(ladder.fresh_command(), now_ns))
         return applied, applied_ns
 
@@ -369,7 +369,7 @@ class CommandHandler(FlightSupervisor):
         kind, seen = type(command.action), self._executor.seen(now_ns)
         if kind is Takeoff:
             self._withdraw_takeoff(now_ns)
-        if self.ladder.continues_landing and not self.checks.goes_on(kind, seen, automatic=command.automatic):
+        if self.ladder.continues_landing and not self.checks.keeps_failsafe(kind, seen, automatic=command.automatic):
             drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is no longer wanted
             self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)

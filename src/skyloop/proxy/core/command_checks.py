@@ -303,7 +303,7 @@ class CommandChecks:
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
             self.way_back = None
-        if automatic and (state is FlightState.LANDING or self.goes_on(kind, seen, automatic=True)):
+        if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
             policy = StatePolicy.HOLD  # it is already landing, which an automatic hover does not abort
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
@@ -312,7 +312,7 @@ class CommandChecks:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
-        if lands and is_set_point and not self.goes_on(kind, seen, automatic=automatic):
+        if lands and is_set_point and not self.keeps_failsafe(kind, seen, automatic=automatic):
             policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
@@ -338,7 +338,7 @@ class CommandChecks:
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
-    def goes_on(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
+    def keeps_failsafe(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
         """Return whether the ladder's task continues, rather than ends, when the holder's command is executed."""
         ladder = self._ladder
         if automatic:

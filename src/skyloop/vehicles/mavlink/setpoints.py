@@ -108,7 +108,7 @@ class SetpointController:
         self._arms_until_ns: int | None = None  # until then, a take-off aborted by a landing may arm the vehicle
         self._disarms_until_ns = 0  # until then, a failed or interrupted take-off may arm the vehicle
         self._blind_until_ns = 0
-        self._not_again = ""  # why repeats of a take-off are refused
+        self._repeats_refused = ""  # why repeats of a take-off are refused
         self._events: list[VehicleEvent] = []
 
     # Decisions ---------------------------------------------------------------------------------------------------
@@ -182,9 +182,9 @@ class SetpointController:
     def _take_off(self, vehicle: VehicleState | None, now_ns: int, *, new: bool) -> None:
         if vehicle is None:
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
-        self._not_again = "" if new else self._not_again
-        if self._not_again:
-            raise DriverError(self._not_again)
+        self._repeats_refused = "" if new else self._repeats_refused
+        if self._repeats_refused:
+            raise DriverError(self._repeats_refused)
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
             self._takeoff.asked_ns = now_ns
             if self._takeoff.refused and not self._takeoff.started:
@@ -428,7 +428,7 @@ class SetpointController:
             self._leave(vehicle)
         elif takeoff.given_up:
             self._notify(f"the vehicle did not take off: {takeoff.given_up}", reason="no_takeoff")
-            self._not_again = takeoff.given_up if takeoff.declined else ""
+            self._repeats_refused = takeoff.given_up if takeoff.declined else ""
             self._end()
             if takeoff.arm_asked_ns is not None:
                 self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING

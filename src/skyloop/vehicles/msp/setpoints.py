@@ -58,10 +58,10 @@ STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means in
 #: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but still shows sinking at 0.15 m/s.
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction while it seems to be on the ground, fraction per second
-OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
-#: The same where it seems to stand far above the ground it left: what still falls at this throttle is in the air, even
-#: if its measured motion lags, as that of a simulated world which runs slower than the firmware's clock.
-OFF_HIGH_BELOW: Final = 0.15
+#: Fraction of the hover throttle below which a vehicle that seems to stand is on the ground, keyed by whether it is
+#: more than HIGH_M above the ground it left. If it is still airborne there, it falls at the lower throttle, which shows
+#: even if its motion is measured too slow, as in a simulated world that lags behind the firmware's clock.
+OFF_BELOW: Final = {False: 0.6, True: 0.15}
 HIGH_M: Final = 0.5
 BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
 BLIND_NS: Final = nanoseconds(6.0)  #: it is disarmed if the climb is unknown for this long
@@ -454,7 +454,7 @@ class SetpointController:
         wanted = hover * (1 + lift / GRAVITY_M_S2) / upright * self._sink
         self.throttle = max(0.0, min(self.limits.throttle, wanted))
         high = (self._motion.height_m or 0.0) > HIGH_M
-        if stands and self.throttle < (OFF_HIGH_BELOW if high else OFF_BELOW) * hover:
+        if stands and self.throttle < OFF_BELOW[high] * hover:
             self._wanted = LEVEL
             self._enter(Phase.STANDING, now_ns)
 

@@ -142,7 +142,7 @@ def test_a_start_whose_flight_control_hangs_is_ended_too(tmp_path: Path, monkeyp
     hangs.mkdir()
     monkeypatch.setenv("STANDIN_HANGS", str(hangs))
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "betaflight")))
-    monkeypatch.setattr(betaflight, "RUN_S", 0.5)
+    monkeypatch.setattr(betaflight, "FLIGHT_CONTROL_S", 0.5)
     kept = tmp_path / "kept"
     kept.mkdir()
     (kept / betaflight.SETTINGS_FILE).touch()  # it is configured

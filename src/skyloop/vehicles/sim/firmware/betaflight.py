@@ -48,7 +48,7 @@ from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
-from skyloop.vehicles.sim.firmware.keeper import hasten, relax
+from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
 
@@ -154,7 +154,7 @@ ANSWER_S: Final = 1.5
 LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each failed start in case the computer is busy
 #: Time allowed for the flight control loop's first run, which ends BOOTGRACE (5 s with an earlier version's settings).
 #: If the scheduler drops that loop, the firmware replies but can never be armed.
-RUN_S: Final = 8.0
+FLIGHT_CONTROL_S: Final = 8.0
 START_S: Final = 5.0  #: longest time from the start of its process until it first sends motors
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
@@ -178,7 +178,7 @@ class Betaflight(CoupledFirmware):
         self._sent_s = 0.0
         self._begun_s = 0.0
         self._patience_s = ANSWER_S
-        self._hastens = False
+        self._has_priority = False
 
     @property
     def address(self) -> str:
@@ -191,9 +191,9 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        if not self._hastens:  # its simulation has to keep pace with the firmware, whose clock doesn't wait
-            self._hastens = True
-            hasten()
+        if not self._has_priority:  # its simulation has to keep pace with the firmware, whose clock doesn't wait
+            self._has_priority = True
+            raise_priority()
         try:
             self._instance = reserve_instance(self.NAME, 1, _ports)
         except UsageError:
@@ -205,9 +205,9 @@ class Betaflight(CoupledFirmware):
         self._motors.setblocking(False)
 
     def _close(self) -> None:
-        if self._hastens:
-            self._hastens = False
-            relax()
+        if self._has_priority:
+            self._has_priority = False
+            restore_priority()
         if self._motors is not None:
             self._motors.close()
             self._motors = None
@@ -251,9 +251,9 @@ class Betaflight(CoupledFirmware):
         """Check that it replies on its serial port and that its flight control has run."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
             try:
-                _until_it_runs(link)
+                _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
-                raise StartedInVainError(f"its flight control did not run within {RUN_S:g} s") from error
+                raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
         time.sleep(_PAUSE_S)  # until it is ready for the next connection, as it accepts only one
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
@@ -369,9 +369,9 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
     return text
 
 
-def _until_it_runs(link: socket.socket) -> None:
+def _wait_for_flight_control(link: socket.socket) -> None:
     """Request its state until that shows that flight control has run. Raises OSError if it never does."""
-    parser, end_s = Parser(), time.monotonic() + RUN_S
+    parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))
         for frame in parser.feed(link.recv(MAX_TEXT)):

@@ -25,6 +25,13 @@ LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which is ahead 
 NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
 SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
+TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
+PROMPT: Final = "--prompt"
+_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
+
+_priority_lock: Final = threading.Lock()  # guards the two below, which are the whole process's, as its niceness is
+_prioritizers = 0  # calls of raise_priority() that are not undone
+_niceness: Final[dict[int, int]] = {}  # before, of each thread whose niceness could be changed
 
 
 def become_prompt() -> None:
@@ -42,45 +49,35 @@ def become_prompt() -> None:
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 
-def hasten() -> None:
+def raise_priority() -> None:
     """Prioritize all threads of this process, and those that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. :func:`relax`, called as often, restores it.
+    Only Linux keeps a niceness for each thread. :func:`restore_priority`, called as often, restores it.
     """
-    global _hasteners  # noqa: PLW0603  (of the whole process, as its niceness is)
-    with _haste:
-        _hasteners += 1
-        for thread in _threads() if _hasteners == 1 else ():
+    global _prioritizers  # noqa: PLW0603
+    with _priority_lock:
+        _prioritizers += 1
+        for thread in _threads() if _prioritizers == 1 else ():
             with suppress(OSError):
                 niceness = os.getpriority(os.PRIO_PROCESS, thread)
                 os.setpriority(os.PRIO_PROCESS, thread, niceness + NICENESS)
                 _niceness[thread] = niceness
 
 
-def relax() -> None:
-    """Restore the niceness from before :func:`hasten`: threads started since get the least favoured one."""
-    global _hasteners  # noqa: PLW0603
-    with _haste:
-        _hasteners -= 1
-        for thread in _threads() if _niceness and not _hasteners else ():
+def restore_priority() -> None:
+    """Restore the niceness from before :func:`raise_priority`: threads started since get the least favoured one."""
+    global _prioritizers  # noqa: PLW0603
+    with _priority_lock:
+        _prioritizers -= 1
+        for thread in _threads() if _niceness and not _prioritizers else ():
             with suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, thread, _niceness.get(thread, max(_niceness.values())))
-        if not _hasteners:
+        if not _prioritizers:
             _niceness.clear()
 
 
 def _threads() -> list[int]:
     return [int(task.name) for task in Path("/proc/self/task").iterdir()] if sys.platform == "linux" else []
-
-
-_haste: Final = threading.Lock()  # guards the two below
-_hasteners = 0
-_niceness: Final[dict[int, int]] = {}  # before, of each thread whose niceness could be changed
-
-
-TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
-PROMPT: Final = "--prompt"
-_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
 def main(arguments: list[str]) -> int:
