@@ -14,7 +14,7 @@ DOORS = {
     "without a key, by QUIC, TLS, TCP or UDP": "a_client_without_a_key_does_not_connect",
     "with a key of the same name from another authority": "a_key_of_another_authority_does_not_connect",
     "with an expired key": "an_expired_key_does_not_connect",
-    "with somebody else's certificate and another key": "anothers_certificate_without_its_key_does_not_connect",
+    "with another's certificate and a different key": "anothers_certificate_without_its_key_does_not_connect",
     "with a key that ends while connected": "a_link_ends_with_its_key",
     "a pilot or an observer listens as if it were a proxy": (
         "no_one_connects_to_a_pilot_or_an_observer_that_poses_as_a_proxy"
@@ -44,7 +44,7 @@ REPLAYS = {
     "by an observer": ("by_an_observer", Refusal.OBSERVER),
     "by a client that did not send Hello": ("by_a_client_without_a_hello", Refusal.PROTOCOL),
     "by the same pilot under a later lease": ("by_the_same_pilot_under_a_later_lease", Refusal.FOREIGN_LEASE),
-    "when nobody flies": ("while_no_one_flies", Refusal.FOREIGN_LEASE),
+    "while no application holds the authority": ("while_no_one_flies", Refusal.FOREIGN_LEASE),
     "after its time, with a newer number": ("after_its_time", Refusal.STALE),
     "with a time in the future": ("before_its_time", Refusal.STALE),
     "after a failsafe, without a new intent of its pilot": ("from_before_the_failsafe", Refusal.NOT_FRESH),
