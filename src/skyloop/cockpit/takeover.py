@@ -248,9 +248,8 @@ class AuthorityReport:
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         sessions = self._station.sessions
         waiting = sorted(session.app for session in sessions if session.waits)
-        # A page's own request is known here before feedback reports it.
         if next_owner is not None and not lost and all(session.app != next_owner for session in sessions):
-            waiting.insert(0, next_owner)
+            waiting.insert(0, next_owner)  # pages' own requests are known here before feedback reports them
         if (state, holder, priority, place, why, waiting) == self._sent:
             return None
         self._sent = state, holder, priority, place, why, waiting
