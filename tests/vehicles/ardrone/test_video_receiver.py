@@ -272,7 +272,7 @@ def test_misuse_is_refused() -> None:
     viewer = Viewer()
     with pytest.raises(UsageError, match=r"there is .* not 3"):
         receiver_of(viewer, 1, version=3)
-    with receiving(viewer, 1, version=1) as receiver, pytest.raises(UsageError, match="was started before"):
+    with receiving(viewer, 1, version=1) as receiver, pytest.raises(UsageError, match="already been started"):
         receiver.start()
 
 
