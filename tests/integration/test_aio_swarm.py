@@ -138,8 +138,8 @@ def test_a_cancelled_each_flies_no_more(field: Field) -> None:
             ended: list[str] = []
 
             async def patrol(drone: aio.Drone) -> None:
-                await flying.wait()
                 try:
+                    await flying.wait()  # the cancellation may come before this one is resumed
                     while True:
                         drone.hover()  # this one is not refused by the cancelled wait
                         await asyncio.sleep(0.01)
