@@ -216,7 +216,7 @@ def target() -> None:
                     page.wait_for_timeout(150)
                     if found:
                         mark(page, found[-1], touch=touch)
-                page.locator(".follow-phase", has_text="Tracked").wait_for()
+                page.locator(".follow-phase", has_text="Tracking").wait_for()
                 page.wait_for_timeout(800)
                 page.locator(".follow-figures", has_text="%").wait_for()
                 if not touch:
@@ -273,7 +273,7 @@ def film() -> None:
         page.mouse.down()
         taken.move(*corner(page, pressed, upper=False), seconds=0.8)
         page.mouse.up()
-        taken.shoot_until(page.locator(".follow-phase", has_text="Tracked"))
+        taken.shoot_until(page.locator(".follow-phase", has_text="Tracking"))
         panel = page.get_by_role("region", name="Target")
         taken.click(panel.get_by_role("button", name="Follow"))
         taken.move(*LAST_PLACE)
@@ -360,8 +360,10 @@ def detecting() -> Iterator[None]:
     """Run a processor that detects people."""
     command = [sys.executable, "-m", "skyloop", "detect", "--on", "alpha"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        yield
-        process.terminate()
+        try:
+            yield
+        finally:
+            process.terminate()
 
 
 # Photographing --------------------------------------------------------------------------------------------------------
