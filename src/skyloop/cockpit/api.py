@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.listening import Admission
     from skyloop.cockpit.routes import RouteFiles
-    from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
 LARGEST_BODY: Final = 65_536  #: maximum size of a request's body [bytes]
@@ -261,7 +260,7 @@ class Api:
     @answered
     async def parameters(self, request: Request) -> Response:
         """Answer with a drone's parameters."""
-        station = self._station(request.path_params["name"])
+        station = self._fleet.station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
         return answer_json([parameter_values(parameter) for parameter in found])
@@ -293,12 +292,6 @@ class Api:
                 "wrong_tokens": self._gate.wrong.count if isinstance(self._gate, TokenGate) else 0,
             }
         )
-
-    def _station(self, name: str) -> Station:
-        stations = self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        return stations[name]
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
@@ -349,10 +342,7 @@ class RoutesApi:
     @answered
     async def check(self, request: Request) -> Response:
         """Answer with a route's problems for a drone, and the ``id`` by which to fly it."""
-        name, stations = request.path_params["name"], self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        station = stations[name]
+        station = self._fleet.station(request.path_params["name"])
         route = parse_route(bytes(await body_of(request, msgspec.Raw)))
         async with self._checking:
             check = await asyncio.to_thread(check_for, station.drone, route, wait_s=0.0)

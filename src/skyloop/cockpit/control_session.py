@@ -53,7 +53,7 @@ from skyloop.cockpit.commands import (
     late_s,
     untimely,
 )
-from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.feeds import call_soon, start_task
 from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
 from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
@@ -596,9 +596,7 @@ class ControlSession:
         self._start_job(self._run(command, work))
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
-        job = asyncio.create_task(work)
-        self._jobs.add(job)
-        job.add_done_callback(self._jobs.discard)
+        start_task(work, self._jobs)
 
     async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import msgspec
@@ -49,6 +49,13 @@ def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *a
     """Call a function on the loop, from any thread. Do nothing if the loop is closed, because no pages are left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
+
+
+def start_task(work: Coroutine[Any, Any, None], running: set[asyncio.Task[None]]) -> None:
+    """Run a coroutine as a task, which stays in the set until it has ended: the loop itself keeps no task alive."""
+    task = asyncio.create_task(work)
+    running.add(task)
+    task.add_done_callback(running.discard)
 
 
 class PeriodicBroadcast:

@@ -20,11 +20,11 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import Alarm, AlarmSeverity
 from skyloop.cockpit.commands import SETTLED_NS, Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
 from skyloop.cockpit.discovery import Finder, Found
-from skyloop.cockpit.feeds import PeriodicBroadcast
+from skyloop.cockpit.feeds import PeriodicBroadcast, start_task
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.telemetry import encode_json
-from skyloop.errors import DecodeError, LinkError, SkyloopError
+from skyloop.errors import DecodeError, LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import HIGHEST_PRIORITY, FlightState, Land, LinkState
 
 if TYPE_CHECKING:
@@ -112,9 +112,7 @@ class Fleet:
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Start work that continues even after the page that requested it is gone."""
-        task = asyncio.create_task(work)
-        self._begun.add(task)
-        task.add_done_callback(self._begun.discard)
+        start_task(work, self._begun)
 
     async def search(self) -> None:
         """Search once: start connecting to new proxies, and remove those that are gone for good.
@@ -141,6 +139,12 @@ class Fleet:
             elif self._forgotten(name, station, now_ns):
                 self.let_go(name)
 
+    def station(self, name: str) -> Station:
+        """Return a drone's station; raise :class:`UnknownNameError` if there is none."""
+        if name not in self.stations:
+            raise UnknownNameError("drone", name, self.stations)
+        return self.stations[name]
+
     @property
     def unreached(self) -> dict[str, str]:
         """Drones that were found but can't be commanded because they are not connected; reasons by name."""
@@ -154,9 +158,7 @@ class Fleet:
     def let_go(self, name: str) -> None:
         """Remove a drone; if it is found again, it reappears. Do nothing if the name is unknown."""
         if name in self.stations:
-            task = asyncio.create_task(self.stations.pop(name).close())
-            self._closing.add(task)
-            task.add_done_callback(self._closing.discard)
+            start_task(self.stations.pop(name).close(), self._closing)
 
     def _forgotten(self, name: str, station: Station, now_ns: int) -> bool:
         gone_ns = now_ns - self._seen_ns.get(name, now_ns)

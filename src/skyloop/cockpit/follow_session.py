@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.feeds import call_soon, start_task
 from skyloop.cockpit.place_flight import UP
 from skyloop.cockpit.target_tracker import Follower, FrameKeeper, TargetTracker, TrackReport
 from skyloop.cockpit.telemetry import number, vector
@@ -209,9 +209,7 @@ class FollowSession:
         if tracker is None:
             return
         tracker.close()
-        ending = asyncio.create_task(asyncio.to_thread(tracker.join, JOIN_S))
-        self._ending.add(ending)
-        ending.add_done_callback(self._ending.discard)
+        start_task(asyncio.to_thread(tracker.join, JOIN_S), self._ending)
         self._tracker = self._pilot = self._action = None
         self._flying, self._waits = False, ""
         if self._watch is not None:

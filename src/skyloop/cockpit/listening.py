@@ -25,6 +25,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.access import Person
+from skyloop.cockpit.feeds import start_task
 from skyloop.messages import Role
 
 MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
@@ -282,9 +283,7 @@ class Listener:
         connection = Connection(address, lambda: _shut(accepted))
         accepted.on_close = lambda: self._admission.closed(connection)
         self._admission.opened(connection, self._clock())
-        task = asyncio.create_task(self._hand_over(accepted, connection))
-        self._handing_over.add(task)
-        task.add_done_callback(self._handing_over.discard)
+        start_task(self._hand_over(accepted, connection), self._handing_over)
 
     async def _hand_over(self, accepted: _Accepted, connection: Connection) -> None:
         timeout_s = None if self._tls is None else HEADER_S

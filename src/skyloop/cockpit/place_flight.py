@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.actions import ReturnWatch, position_action
+from skyloop.cockpit.feeds import start_task
 from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto, save_photo
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import LinkError, RefusedError, SkyloopError
@@ -245,9 +246,7 @@ class RouteSession:
                 if send:
                     self._command(effect.action, automatic=automatic)
             elif isinstance(effect, TakePhoto):
-                task = asyncio.create_task(self._photograph(effect))
-                self._photos.add(task)
-                task.add_done_callback(self._photos.discard)
+                start_task(self._photograph(effect), self._photos)
             else:
                 self._send_progress(effect)
         if effects:

@@ -14,14 +14,12 @@ from starlette.routing import Route
 
 from skyloop.cockpit import recording_files
 from skyloop.cockpit.api import answer_json, answered, body_of, check_json, while_wanted
-from skyloop.cockpit.reports import MARK
-from skyloop.errors import UnknownNameError, UsageError
+from skyloop.cockpit.recordings import MARK, Recordings
+from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recording_files import Notes
-    from skyloop.cockpit.recordings import Recordings
-    from skyloop.cockpit.station import Station
 
 #: A report is a complete page with an inline script; it runs without this page's permissions.
 _REPORT_POLICY: Final = (
@@ -104,7 +102,7 @@ class RecordingsApi:
         """Start a recording."""
         wanted = await body_of(request, _Wanted)
         for name in wanted.drones:
-            self._station(name)
+            self._fleet.station(name)
         return answer_json(await self._recordings.start(wanted.drones), 201)
 
     @answered
@@ -213,7 +211,7 @@ class RecordingsApi:
         """Pause, resume or move a replay, or change its speed; answer once the replay has accepted the change."""
         wanted = await body_of(request, _Playback)
         name = request.path_params["name"]
-        station = self._station(name)
+        station = self._fleet.station(name)
         if not station.drone.uri.startswith("replay:"):
             raise UsageError(f"{name} is not a replay: it can't be paused or moved")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
@@ -239,9 +237,3 @@ class RecordingsApi:
 
     async def _move(self, request: Request, change: Callable[[Path], str]) -> Response:
         return answer_json({"name": await self._recordings.move(request.path_params["name"], change)})
-
-    def _station(self, name: str) -> Station:
-        stations = self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        return stations[name]

@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     import uvicorn
     from starlette.applications import Starlette
 
-    from skyloop.cockpit.access import Gate
+    from skyloop.cockpit.access import Gate, SessionFile
     from skyloop.cockpit.discovery import Finder
     from skyloop.cockpit.fleet import Fleet
-    from skyloop.cockpit.sessions import SessionFile
     from skyloop.cockpit.station import Station
     from skyloop.messages.parameter import WorldGeometry
     from skyloop.metrics.endpoint import Source
@@ -231,7 +230,7 @@ def _session_file(cookie: str) -> SessionFile | None:
     """Return the file where sessions outlive this process; None if no folder belongs to this user alone."""
     if sys.platform != "linux":
         return None
-    from skyloop.cockpit.sessions import SessionFile
+    from skyloop.cockpit.access import SessionFile
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()

@@ -21,7 +21,7 @@ from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.control.waypoint import Waypoint
 from skyloop.errors import LinkError, NoAnswerError, RefusedError, SkyloopError
 from skyloop.extend import Known, commands, let_go, open_unasked
-from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Outcome
+from skyloop.messages import AnyAction, CameraInfo, EventKind, FlightState, Idle, LinkState, Outcome
 from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
@@ -215,15 +215,19 @@ class Station:
         """The feeds of all cameras, in all sizes and forms."""
         return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
+    def camera_info(self, name: str) -> CameraInfo | None:
+        """Return a camera's description, or None if the vehicle has no such camera."""
+        return next((info for info in self.drone.capabilities.cameras if info.name == name), None)
+
     def camera(self, name: str) -> CameraFeed | None:
         """Return a camera's feed, or None if the vehicle has no such camera."""
-        if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
+        if name not in self.cameras and self.camera_info(name) is not None:
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
 
     def small_video(self, name: str, width: int) -> SmallFeed | None:
         """Return a camera's feed scaled down to a width [pixels], or None if the vehicle has no such camera."""
-        camera = next((info for info in self.drone.capabilities.cameras if info.name == name), None)
+        camera = self.camera_info(name)
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))

@@ -20,7 +20,7 @@ from skyloop.client import Level, PreflightFinding
 from skyloop.cockpit.api import BadRequest, answer_json, answered
 from skyloop.cockpit.feeds import ROW_HZ
 from skyloop.cockpit.telemetry import Json, number, vector
-from skyloop.errors import NoAnswerError, ParameterError, UnknownNameError
+from skyloop.errors import NoAnswerError, ParameterError
 from skyloop.messages import Position
 from skyloop.messages.parameter import WORLD, WorldGeometry, decode_world
 from skyloop.proxy.core.airspace import Airspace
@@ -231,11 +231,9 @@ class WorldApi:
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
         """Query a drone on a thread, because its answer may take a while."""
-        name, stations = request.path_params["name"], self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
+        drone = self._fleet.station(request.path_params["name"]).drone
         async with self._asking:
-            return answer_json(await asyncio.to_thread(question, stations[name].drone))
+            return answer_json(await asyncio.to_thread(question, drone))
 
 
 def _place(text: str) -> tuple[float, float, float]:
