@@ -179,13 +179,9 @@ class Command(TyperCommand):
 
 
 class WithBehaviours(Command):
-    """A command whose first word may be another command with its own options: ``skyloop fly follow``.
+    """A command whose first word may be another command with its own options: ``skyloop fly follow``."""
 
-    Attributes:
-        behaviours: The other commands, by name.
-    """
-
-    behaviours: ClassVar[Mapping[str, Any]] = {}
+    behaviours: ClassVar[Mapping[str, Any]] = {}  #: the other commands, by name
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         """Parse the words for the command that they select."""

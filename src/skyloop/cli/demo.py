@@ -168,20 +168,8 @@ def drone_and_page(
 ) -> Iterator[tuple[Drone, CockpitProcess | None, float]]:
     """Connect to a vehicle, wait for its first image, and show the page.
 
-    Args:
-        uri: The vehicle's address.
-        console: The console for output.
-        name: The pilot's name as shown to others.
-        stop: Called on the first Ctrl-C.
-        port: The page's port; None: the default one.
-        page_shown: Whether to show a page.
-        browser: Whether to open the page in the browser.
-
-    Yields:
-        The drone, the page if there is one, and the time of the first image (monotonic) [s].
-
-    Raises:
-        SkyloopError: Connecting failed.
+    ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port;
+    None: the default one. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess

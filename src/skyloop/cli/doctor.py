@@ -299,11 +299,7 @@ def _proxies() -> Iterator[Finding]:
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """Return the findings about a vehicle in reading order.
-
-    Raises:
-        SkyloopError: The address is invalid.
-    """
+    """Return the findings about a vehicle in reading order. Raise ``SkyloopError`` if the address is invalid."""
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.drivers.registry import make_driver
 

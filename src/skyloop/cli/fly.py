@@ -109,8 +109,7 @@ def fly(
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
     """Create the user's controller, and report methods that look like misspelt callbacks.
 
-    Raises:
-        UsageError: The class can't be created with a drone as its only argument.
+    Raise ``UsageError`` if the class can't be created with a drone as its only argument.
     """
     from skyloop.control.controller import misspelt
 

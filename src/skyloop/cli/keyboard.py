@@ -276,9 +276,8 @@ class Tokenizer:
 class Keyboard:
     """Reads the terminal's keys one by one, without Enter; a context manager that restores the terminal.
 
-    Raises:
-        UsageError: Standard input is not a terminal.
-        UnsupportedError: This platform's terminals can't report single keys.
+    Raise ``UsageError`` if standard input is not a terminal, or ``UnsupportedError`` if this platform's terminals can't
+    report single keys.
     """
 
     def __init__(self) -> None:
@@ -328,11 +327,7 @@ class Keyboard:
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
-        """Return the keys pressed, as soon as there are any.
-
-        Raises:
-            EOFError: The terminal is gone.
-        """
+        """Return the keys pressed, as soon as there are any. Raise ``EOFError`` if the terminal is gone."""
         if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)

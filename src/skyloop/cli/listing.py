@@ -176,11 +176,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer with this name, over the transport in its row.
-
-    Raises:
-        SkyloopError: The proxy does not answer.
-    """
+    """Connect to a proxy as an observer with this name, over the transport in its row."""
     from skyloop.client import connect
 
     far = "local" not in row.transport

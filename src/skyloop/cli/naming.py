@@ -117,13 +117,8 @@ def keys_directory() -> Path:
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
     """Return the drone that a command is for.
 
-    Args:
-        name: The drone given as NAME.
-        drone: The drone given as ``--drone``.
-        default: Used if neither is given; None: a name is required.
-
-    Raises:
-        UsageError: No drone is given, or two are.
+    ``default``: used if neither is given; None: a name is required. Raise ``UsageError`` if no drone is given, or two
+    are.
     """
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
@@ -136,8 +131,7 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
     """Return the drones that a command is for, each once: those given as NAME first, then those given as ``--drone``.
 
-    Raises:
-        UsageError: No drone is given, but one is required.
+    Raise ``UsageError`` if no drone is given, but one is required.
     """
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
@@ -153,8 +147,7 @@ def _running() -> str:
 def join_network(network: str | None, keys: Path | None) -> None:
     """Search the network given by the options, in this process and its children.
 
-    Raises:
-        UsageError: An address or the folder is invalid, or keys are given without a network.
+    Raise ``UsageError`` if an address or the folder is invalid, or keys are given without a network.
     """
     if network is None and keys is None:
         return

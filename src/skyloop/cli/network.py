@@ -78,8 +78,7 @@ def settings_of(
 ) -> FabricSettings | None:
     """Return the settings given by the options, or None to stay on this host.
 
-    Raises:
-        UsageError: An option needs ``--network``, or is invalid.
+    Raise ``UsageError`` if an option needs ``--network``, or is invalid.
     """
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
@@ -95,8 +94,7 @@ def places(
 ) -> FabricSettings:
     """Return the settings of a network given as in ``--network``.
 
-    Raises:
-        UsageError: An address or the folder is invalid, or no place is given.
+    Raise ``UsageError`` if an address or the folder is invalid, or no place is given.
     """
     from skyloop.network.config import serving
 
@@ -122,8 +120,7 @@ def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | No
 def metrics_beside(where: str | None) -> Beside | None:
     """Return the metrics server to run along with a process's proxies; None without ``--metrics``.
 
-    Raises:
-        UsageError: ``where`` is not an address.
+    Raise ``UsageError`` if ``where`` is not an address.
     """
     if where is None:
         return None
@@ -147,9 +144,6 @@ def settle(options: SimOptions) -> None:
 
     The GIL is released after one millisecond instead of five, and OpenCV uses one core. Do not call this in the user's
     process.
-
-    Raises:
-        MissingExtraError: Cameras were requested, but the renderer's extra is not installed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:

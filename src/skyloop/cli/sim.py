@@ -178,8 +178,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
     """Return the options of the world that the drones share.
 
-    Raises:
-        UsageError: An option is invalid, or the drones can't share a world.
+    Raise ``UsageError`` if an option is invalid, or the drones can't share a world.
     """
     from skyloop.vehicles.sim.options import options_of
 
@@ -215,11 +214,7 @@ def _serve_proxies(
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """Return the vehicles' address.
-
-    Raises:
-        UsageError: An option does not exist, or its value is invalid.
-    """
+    """Return the vehicles' address. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
@@ -261,11 +256,8 @@ class Serving:
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
     """Run the drones until SIGINT or SIGTERM. Must run on the main thread.
 
-    Once all drones listen, print a line that begins with ``ready`` for each.
-
-    Raises:
-        UsageError: An option is invalid.
-        LinkError: A port is already in use.
+    Once all drones listen, print a line that begins with ``ready`` for each. Raise ``UsageError`` if an option is
+    invalid, or ``LinkError`` if a port is already in use.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
@@ -362,8 +354,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 def address_from(base: str, drone: int) -> str:
     """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
 
-    Raises:
-        UsageError: The first address is not IPv4, or there is no next address.
+    Raise ``UsageError`` if the first address is not IPv4, or there is no next address.
     """
     if drone == 0:
         return base
@@ -376,8 +367,7 @@ def address_from(base: str, drone: int) -> str:
 def ports_from(base: int, drone: int) -> Ports:
     """Return the ports of an AR.Drone: the first one's start at ``base`` (0: any free ones), each next one's 10 higher.
 
-    Raises:
-        UsageError: A port is out of range.
+    Raise ``UsageError`` if a port is out of range.
     """
     from skyloop.vehicles.ardrone.emulator import Ports
 

@@ -78,11 +78,7 @@ class Teleop:
         self._taking = threading.Thread()
 
     def run(self, keyboard: Keyboard) -> None:
-        """Fly until Q is pressed.
-
-        Raises:
-            EOFError: The terminal is gone.
-        """
+        """Fly until Q is pressed. Raise ``EOFError`` if the terminal is gone."""
         # Draw on a separate thread: a stalled terminal must not delay keys.
         console = Console()
         with (

@@ -67,14 +67,7 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
     Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
     proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
     state, …, user id and inode. A socket already closed by its program is listed with user 0 and inode 0, so an entry
-    without an inode does not reveal who opened it.
-
-    Args:
-        client: The client's address and port.
-        server: This server's address and port.
-
-    Returns:
-        The user id, or None if it is unknown.
+    without an inode does not reveal who opened it. Return the user id, or None if it is unknown.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -97,9 +90,7 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 def _table_entry(end: Endpoint, mapped: bool) -> str:
     """Format an address as in the table: 32-bit words in the host's byte order.
 
-    Args:
-        end: Address and port.
-        mapped: Whether to write an IPv4 address as an IPv4-mapped IPv6 address.
+    ``mapped``: whether to write an IPv4 address as an IPv4-mapped IPv6 address.
     """
     address = ipaddress.ip_address(end[0])
     packed = address.packed
@@ -140,9 +131,7 @@ class Gate(Protocol):
 class OpenGate:
     """Gives one role to every program of the same user on this machine.
 
-    Args:
-        role: The role.
-        uid_of: Returns the client's user id, given both ends' addresses.
+    ``uid_of``: returns the client's user id, given both ends' addresses.
     """
 
     takes_tokens = False
@@ -171,9 +160,7 @@ class Token:
 class Pairing:
     """Issues codes that admit one browser each, only once and within :data:`PAIRING_S`. Used on the event loop.
 
-    Args:
-        role: The role given to browsers that use a code.
-        clock: The monotonic clock [ns].
+    ``role``: the role given to browsers that use a code.
     """
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
@@ -223,12 +210,8 @@ class TokenGate:
     ) -> None:
         """Restore the saved sessions whose token or pairing role is still valid.
 
-        Args:
-            tokens: The tokens to accept.
-            cookie: The name of the session cookie.
-            clock: The monotonic clock [ns].
-            pairing: Issues one-time codes, which can be used in place of a token.
-            kept: Where sessions are stored between runs of the cockpit.
+        ``pairing``: issues one-time codes, which can be used in place of a token. ``kept``: where sessions are stored
+        between runs of the cockpit.
         """
         self.cookie = cookie
         self.pairing = pairing
@@ -273,9 +256,7 @@ class TokenGate:
     def begin(self, person: Person, token: str = "") -> str:
         """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
 
-        Args:
-            person: The owner of the session.
-            token: The token that the session was given for.
+        ``token``: the token that the session was given for.
         """
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
@@ -318,12 +299,8 @@ class CertificateGate:
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
     """Return the role and name in a certificate.
 
-    Args:
-        certificate: The certificate in the form returned by ``SSLObject.getpeercert()``.
-
-    Returns:
-        The role from the organizational unit and the name from the common name. None if no OU is a role, or several
-        are.
+    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None if no OU is a
+    role, or several are.
     """
     if not certificate:
         return None
@@ -339,11 +316,9 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
 def read_tokens(path: Path) -> list[Token]:
     """Read the token file.
 
-    Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped.
-
-    Raises:
-        UsageError: The file can't be read, or is readable by others.
-        FileFormatError: A line is invalid, or there is no token.
+    Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped. Raise
+    ``UsageError`` if the file can't be read, or is readable by others, or ``FileFormatError`` if a line is invalid, or
+    there is no token.
     """
     try:
         mode = path.stat().st_mode
@@ -409,9 +384,6 @@ class WrongTokens:
     delayed, so an attacker can't lock out its owner, not even from the same address. Only rejections get slower: a
     guesser who waits for the answers gets few of them. A guesser who takes silence for a rejection is limited only by
     the rate of connections; the length of the tokens protects against that.
-
-    Args:
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, clock: Clock = monotonic_ns) -> None:

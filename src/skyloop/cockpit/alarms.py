@@ -82,13 +82,8 @@ def alarms(
 ) -> list[Alarm]:
     """Return the current alarms, the most severe first.
 
-    Args:
-        link: The state of both hops.
-        feedback: The newest feedback, or None.
-        feedback_age_s: Age of that feedback [s].
-        video_age_s: Age of the frame shown [s], for each camera that is watched.
-        degraded_s: How long each degraded hop has been degraded [s], from :class:`DegradedTimes`.
-        thresholds: The limits for charges, ages and degraded links.
+    ``video_age_s``: age of the frame shown [s], for each camera that is watched. ``degraded_s``: how long each degraded
+    hop has been degraded [s], from :class:`DegradedTimes`.
     """
     # On the ground there is time: an alarm is urgent only if the vehicle is, or was last reported, in the air.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
@@ -173,10 +168,6 @@ class ThresholdReader:
     """Reads the thresholds, and reads them again after a parameter was written or a link was restored.
 
     Created and used on the event loop.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -218,11 +209,7 @@ class ThresholdReader:
 
 
 def thresholds_of(config: _Readable) -> Thresholds:
-    """Read the thresholds; use the default for any that the proxy lacks or that is not finite.
-
-    Raises:
-        SkyloopError: The proxy does not answer.
-    """
+    """Read the thresholds; use the default for any that the proxy lacks or that is not finite."""
     return msgspec.structs.replace(USUAL, **{field: _number(config, name, field) for field, name in PARAMETERS.items()})
 
 

@@ -80,14 +80,7 @@ def answered(handler: Handler) -> Handler:
 
 
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Do work for a request, but cancel it if the client disconnects.
-
-    Returns:
-        The result of ``work``.
-
-    Raises:
-        ClientDisconnect: The client has disconnected.
-    """
+    """Do work for a request, but cancel it if the client disconnects."""
     task, gone = asyncio.create_task(work), asyncio.create_task(_gone(request))
     try:
         await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -119,12 +112,7 @@ def check_json(request: Request) -> None:
 async def body_of(request: Request, kind: type[T]) -> T:
     """Read and decode a request's body.
 
-    Args:
-        request: The request.
-        kind: The type to decode.
-
-    Raises:
-        BadRequest: The body is not JSON, is too large, does not arrive in time, or has the wrong type.
+    Raise ``BadRequest`` if the body is not JSON, is too large, does not arrive in time, or has the wrong type.
     """
     check_json(request)
     data = b""
@@ -149,13 +137,7 @@ class _Login(msgspec.Struct):
 class Api:
     """The routes below ``/api``.
 
-    Args:
-        fleet: The drones.
-        gate: Decides who is admitted.
-        counts: Counts of the messages sent to pages.
-        scheme: ``http`` or ``https``.
-        admission: The open connections.
-        authority: PEM certificate of the authority that signed the server's; None if the cockpit created none.
+    ``authority``: PEM certificate of the authority that signed the server's; None if the cockpit created none.
     """
 
     def __init__(
@@ -317,12 +299,7 @@ def _value(value: Value) -> Any:
 
 
 class RoutesApi:
-    """The routes below ``/api/routes``, and the check of a route for one drone.
-
-    Args:
-        fleet: The drones.
-        files: The stored routes.
-    """
+    """The routes below ``/api/routes``, and the check of a route for one drone."""
 
     def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
         self._fleet = fleet

@@ -96,13 +96,8 @@ class ControlSession:
     ) -> None:
         """Prepare the session; :meth:`run` serves it.
 
-        Args:
-            socket: The socket, already accepted.
-            station: The drone.
-            person: The pilot's name, if known.
-            clock: The monotonic clock [ns].
-            photos: The folder for photos taken along routes; each drone has a subfolder.
-            follower: Creates followers for targets that the page marks.
+        ``photos``: the folder for photos taken along routes; each drone has a subfolder. ``follower``: creates
+        followers for targets that the page marks.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
@@ -227,14 +222,7 @@ class ControlSession:
         """Send one command, ending the page's previous flight.
 
         The command is complete once it is sent or, if ``until`` names states, once the vehicle is in one of them.
-
-        Args:
-            command: The page's command.
-            act: Sends the command; returns whether it was sent.
-            until: The states that complete the command.
-
-        Raises:
-            SkyloopError: Any error from the drone; :class:`LinkError` if the command was not sent.
+        ``act``: sends the command; returns whether it was sent. ``until``: the states that complete the command.
         """
         pilot = self._held()
         self._send_now(pilot, act, command)
@@ -429,8 +417,7 @@ class ControlSession:
     def _held(self) -> PilotConnection:
         """Return the connection that holds the authority.
 
-        Raises:
-            AuthorityError: The page does not hold the authority.
+        Raise ``AuthorityError`` if the page does not hold the authority.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":

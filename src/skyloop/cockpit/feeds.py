@@ -64,10 +64,7 @@ class PeriodicBroadcast:
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
         """Initialise without starting; the first subscriber starts it.
 
-        Args:
-            period_s: Time between two messages [s].
-            make: Creates a message.
-            on_change: Called with True before the first subscriber is added, and with False after the last has left.
+        ``on_change``: called with True before the first subscriber is added, and with False after the last has left.
         """
         self.message = b""  #: the newest message
         self.closed = False  #: whether no more messages will be created
@@ -200,10 +197,6 @@ class EventFeed:
     """The drone's annotations and events.
 
     Events are numbered here, because events created by the client have no number.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -256,10 +249,6 @@ class LogFeed:
     """The logs of applications, and the command last applied.
 
     Subscribed to only on demand, to save the proxy work. The client's receiving thread replaces the values as a whole.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -297,8 +286,7 @@ class LogFeed:
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
         """Return the array ``waypoints`` that was logged last, if within :data:`KEPT_S`.
 
-        Returns:
-            Rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
+        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
         """
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
@@ -306,8 +294,7 @@ class LogFeed:
     def mocap(self) -> tuple[float, ...] | None:
         """Return the newest pose from motion capture.
 
-        Returns:
-            x, y, z [m] and quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
+        Return x, y, z [m] and quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
         """
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None

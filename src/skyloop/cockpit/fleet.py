@@ -49,8 +49,7 @@ Json = dict[str, Any]
 def observe(found: Found) -> Drone:
     """Connect to a proxy as an observer.
 
-    Raises:
-        SkyloopError: The connection was not established within :data:`CONNECT_S`.
+    Raise ``SkyloopError`` if the connection was not established within :data:`CONNECT_S`.
     """
     from skyloop.client.drone import open_drone
 
@@ -60,12 +59,7 @@ def observe(found: Found) -> Drone:
 class Fleet:
     """The stations, by drone name.
 
-    Args:
-        finder: Finds proxies.
-        connect: Connects to a proxy; called on threads.
-        kept: Names that stay listed once found.
-        clock: The monotonic clock [ns].
-        look_s: Interval between searches [s].
+    ``connect``: connects to a proxy; called on threads. ``kept``: names that stay listed once found.
     """
 
     def __init__(
@@ -115,12 +109,7 @@ class Fleet:
         start_task(work, self._begun)
 
     async def search(self) -> None:
-        """Search once: start connecting to new proxies, and remove those that are gone for good.
-
-        Raises:
-            SkyloopError: Searching is currently not possible.
-            OSError: Searching is currently not possible.
-        """
+        """Search once: start connecting to new proxies, and remove those that are gone for good."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -187,13 +176,7 @@ class Fleet:
 
 
 class Overview:
-    """All drones in one message, created twice a second for all pages.
-
-    Args:
-        fleet: The drones.
-        recordings: The recordings of the same drones.
-        period_s: Time between two messages [s].
-    """
+    """All drones in one message, created twice a second for all pages."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
         self._fleet = fleet
@@ -240,14 +223,7 @@ class FleetSession:
     """Serves one socket of a pilot's page; its commands complete even if the page goes away. On the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
-        """Prepare the session; :meth:`run` serves it.
-
-        Args:
-            socket: The socket, already accepted.
-            fleet: The drones.
-            person: The pilot's name, if known.
-            clock: The monotonic clock [ns].
-        """
+        """Prepare the session; :meth:`run` serves it."""
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._fleet = fleet

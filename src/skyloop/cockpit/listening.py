@@ -120,13 +120,7 @@ class Admission:
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
         """Record that a complete request arrived.
 
-        Args:
-            connection: The connection that the request arrived on.
-            person: Who sent it; None for a stranger.
-            now_ns: The monotonic clock [ns].
-
-        Returns:
-            Why the request is refused; empty if it is not.
+        ``person``: who sent it; None for a stranger. Return why the request is refused; empty if it is not.
         """
         if person is None:
             connection.asked = True
@@ -220,15 +214,7 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop.
-
-    Args:
-        listening: The listening socket, already bound.
-        admission: Counts the connections.
-        protocol: Creates the HTTP protocol for a connection.
-        tls: The TLS context for HTTPS.
-        clock: The monotonic clock [ns].
-    """
+    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop."""
 
     def __init__(
         self,
@@ -330,10 +316,6 @@ class RepeatLimit(logging.Filter):
 
     Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
     one that it passed longest ago.
-
-    Args:
-        every_s: The period [s].
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, every_s: float = 10.0, clock: Clock = monotonic_ns) -> None:

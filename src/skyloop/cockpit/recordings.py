@@ -67,11 +67,7 @@ class Running:
 
 
 def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
-    """Record proxies to a new file in a folder.
-
-    Raises:
-        SkyloopError: It can't start.
-    """
+    """Record proxies to a new file in a folder."""
     from skyloop.recording import record
 
     return record(drones, folder)
@@ -80,12 +76,7 @@ def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
 def start_replay(path: Path, drone: str | None = None) -> Drone:
     """Start a private proxy that plays a file, and connect to it.
 
-    Args:
-        path: The file.
-        drone: The recorded drone to play; None for the first.
-
-    Raises:
-        SkyloopError: It can't start.
+    ``drone``: the recorded drone to play; None for the first.
     """
     from skyloop.client import connect
 
@@ -132,10 +123,8 @@ NOTE_SHOWN: Final = 200  #: number of characters of a note shown in the list
 class Recordings:
     """The recordings in one folder. On the event loop.
 
-    Args:
-        folder: Created when needed.
-        record: Starts a recorder; called on a thread.
-        replay: Starts a replay; called on a thread.
+    ``folder``: created when needed. ``record``: starts a recorder; called on a thread. ``replay``: starts a replay;
+    called on a thread.
     """
 
     def __init__(
@@ -165,16 +154,8 @@ class Recordings:
     async def start(self, drones: Sequence[str]) -> Json:
         """Start recording.
 
-        Args:
-            drones: The names of the drones.
-
-        Returns:
-            The recording, as JSON values.
-
-        Raises:
-            UsageError: No drone was given, or the folder can't be created.
-            RefusedError: :data:`MAX_CHILDREN` recordings are already running.
-            SkyloopError: The recorder can't start.
+        Raise ``UsageError`` if no drone was given, or the folder can't be created, or ``RefusedError`` if
+        :data:`MAX_CHILDREN` recordings are already running.
         """
         if not drones:
             raise UsageError("no drone to record: name at least one")
@@ -193,11 +174,7 @@ class Recordings:
     async def stop(self, number: str) -> Json:
         """Stop a recording and wait until its file is closed.
 
-        Returns:
-            The recording, as JSON values.
-
-        Raises:
-            UnknownNameError: No such recording is running.
+        Raise ``UnknownNameError`` if no such recording is running.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -217,9 +194,7 @@ class Recordings:
     def mark(self, number: str, text: str) -> tuple[str, ...]:
         """Check a mark for a running recording and return the drones it applies to.
 
-        Raises:
-            UnknownNameError: No such recording is running.
-            UsageError: The text is too long.
+        Raise ``UnknownNameError`` if no such recording is running, or ``UsageError`` if the text is too long.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -231,17 +206,15 @@ class Recordings:
     async def path(self, name: str) -> Path:
         """Return the path of a recording.
 
-        Raises:
-            UnknownNameError: The file does not exist, or is being recorded.
+        Raise ``UnknownNameError`` if the file does not exist, or is being recorded.
         """
         return await asyncio.to_thread(self._path, name)
 
     async def move(self, name: str, change: Callable[[Path], str]) -> str:
         """Rename or delete a recording that is neither being written nor replayed; return its new name.
 
-        Raises:
-            UnknownNameError: The file does not exist.
-            RefusedError: The recording is in use, or ``change`` refuses.
+        Raise ``UnknownNameError`` if the file does not exist, or ``RefusedError`` if the recording is in use, or
+        ``change`` refuses.
         """
         async with self._starting, self._changing:
             for running in self._running.values():
@@ -290,12 +263,8 @@ class Recordings:
     async def replayed(self, name: str) -> Json:
         """Return the recording's data for the page's replay bar.
 
-        Returns:
-            The file's name, the result of :func:`skyloop.cockpit.recordings.timeline`, and the notes, as JSON values.
-
-        Raises:
-            UnknownNameError: No such replay was started here.
-            SkyloopError: Any error from :meth:`skyloop.cockpit.recordings.Reports.make`.
+        Return the file's name, the result of :func:`skyloop.cockpit.recordings.timeline`, and the notes, as JSON
+        values. Raise ``UnknownNameError`` if no such replay was started here.
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
@@ -308,11 +277,7 @@ class Recordings:
         return {"recording": shown_name(replay.path), "notes": notes, "timeline": msgspec.Raw(self._made[key].encode())}
 
     async def end_replay(self, name: str) -> None:
-        """End a replay.
-
-        Raises:
-            UnknownNameError: No such replay is running.
-        """
+        """End a replay. Raise ``UnknownNameError`` if no such replay is running."""
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
         await asyncio.to_thread(self.replays.pop(name).drone.close)
@@ -422,10 +387,8 @@ class Reports:
 
     A report keeps a core busy for seconds, and any observer may request one. Requests therefore wait in a short queue
     and are refused when it is full. If a client disconnects, its request leaves the queue or its child is ended.
-
-    Args:
-        command: Returns the child's command line; by default :func:`child_command`.
-        what: The name of the product in error messages.
+    ``command``: returns the child's command line; by default :func:`child_command`. ``what``: the name of the product
+    in error messages.
     """
 
     def __init__(self, command: Command | None = None, what: str = "report") -> None:
@@ -492,11 +455,8 @@ class Reports:
 def run_child(arguments: Sequence[str]) -> int:
     """Write a report or timeline, unless standard input closes first, which means that the requester is gone.
 
-    Args:
-        arguments: ``report`` or ``timeline``, FILE TARGET [DRONE], from the command line.
-
-    Returns:
-        The exit code: 0, or 2 with a line of explanation.
+    ``arguments``: ``report`` or ``timeline``, FILE TARGET [DRONE], from the command line. Return the exit code: 0, or 2
+    with a line of explanation.
     """
     os.nice(NICENESS)
     on_parent_end(partial(os._exit, 1))
@@ -531,12 +491,7 @@ _LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})
 
 
 def timeline(recording: Recording, drone: str) -> dict[str, Any]:
-    """Return a recording's events and course as JSON values, with positions like ``replay.position_s``.
-
-    Args:
-        recording: The recording.
-        drone: The name of one of its drones.
-    """
+    """Return a recording's events and course as JSON values, with positions like ``replay.position_s``."""
     course = Course()
     events: list[dict[str, Any]] = []
     marks: list[dict[str, Any]] = []

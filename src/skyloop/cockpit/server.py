@@ -240,11 +240,7 @@ def _session_file(cookie: str) -> SessionFile | None:
 
 
 def _tls(access: Access) -> ssl.SSLContext:
-    """Create the server's TLS context.
-
-    Raises:
-        UsageError: A file is invalid.
-    """
+    """Create the server's TLS context. Raise ``UsageError`` if a file is invalid."""
     assert access.tls_cert is not None
     for file in filter(None, (access.tls_cert, access.tls_key)):
         if not file.exists():
@@ -309,13 +305,7 @@ def _serve(
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
-    """Return a factory for the HTTP protocol of connections to a server that has started.
-
-    Args:
-        server: The server.
-        admission: Informed about the progress of each connection.
-        clock: The monotonic clock [ns].
-    """
+    """Return a factory for the HTTP protocol of connections to a server that has started."""
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     from skyloop.cockpit.access import CERTIFICATE

@@ -47,16 +47,7 @@ class PilotConnection(Drone):
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
-        """Connect without requesting the authority.
-
-        Args:
-            dial: Opens a new connection to the proxy on each call.
-            app: The name to connect under.
-            timeout_s: Time for the proxy to answer [s].
-
-        Raises:
-            SkyloopError: The connection can't be opened.
-        """
+        """Connect without requesting the authority. ``dial``: opens a new connection to the proxy on each call."""
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
@@ -80,27 +71,15 @@ class PilotConnection(Drone):
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
         """Request the authority now.
 
-        Args:
-            priority: 0 is the highest, 31 the lowest.
-            ask: Ask the holder first, and wait in the queue instead of failing.
-
-        Raises:
-            AuthorityError: Another application holds the authority; the message names it.
+        ``priority``: 0 is the highest, 31 the lowest. ``ask``: ask the holder first, and wait in the queue instead of
+        failing. Raise ``AuthorityError`` if another application holds the authority; the message names it.
         """
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
         """Answer a request for the authority and wait until the proxy has received the answer.
 
-        Args:
-            lease: The lease by which this connection holds the authority.
-            app_id: The application that asked.
-            grant: Whether to hand the authority over.
-            reason: The reason for a refusal, shown to the person who asked.
-
-        Raises:
-            RefusedError: This connection no longer holds the authority.
-            LinkError: The proxy does not answer.
+        Raise ``RefusedError`` if this connection no longer holds the authority.
         """
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
@@ -172,9 +151,7 @@ class FlyingSession(Protocol):
 class Station:
     """One drone and the state that its pages share. Created and closed on the event loop.
 
-    Args:
-        found: The address of the proxy.
-        drone: The drone, connected as an observer; closed by :meth:`close`.
+    ``drone``: the drone, connected as an observer; closed by :meth:`close`.
     """
 
     def __init__(self, found: Found, drone: Drone) -> None:
@@ -256,16 +233,14 @@ class Station:
     def feedback(self) -> Feedback:
         """Return the newest feedback, which arrives at a low rate while pages show only the drone's row.
 
-        Raises:
-            LinkError: There is no feedback, or the drone was closed.
+        Raise ``LinkError`` if there is no feedback, or the drone was closed.
         """
         return self.drone.feedback(max_hz=ROW_HZ)
 
     def fresh_feedback(self) -> Feedback:
         """Wait for a state captured from now on, because the newest feedback may predate a take-off.
 
-        Raises:
-            LinkError: No feedback arrives within :data:`FRESH_S`.
+        Raise ``LinkError`` if no feedback arrives within :data:`FRESH_S`.
         """
         now_ns = self.drone.now_ns
         return self.drone.wait(lambda feedback: feedback.captured_ns >= now_ns, FRESH_S)
@@ -289,11 +264,7 @@ class Station:
     async def open_pilot(self, app: str) -> PilotConnection:
         """Open a pilot's connection that does not hold the authority yet.
 
-        Args:
-            app: The name to connect under.
-
-        Raises:
-            SkyloopError: The connection can't be opened within :data:`PILOT_S`.
+        Raise ``SkyloopError`` if the connection can't be opened within :data:`PILOT_S`.
         """
 
         def connect() -> PilotConnection:
@@ -323,11 +294,7 @@ class Station:
             await self._end(stopper)
 
     async def stopper(self) -> PilotConnection:
-        """Return the pilot's connection for emergency stops, which never holds the authority.
-
-        Raises:
-            SkyloopError: The connection can't be opened.
-        """
+        """Return the pilot's connection for emergency stops, which never holds the authority."""
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
         return await asyncio.shield(self._stopper)

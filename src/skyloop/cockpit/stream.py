@@ -81,9 +81,7 @@ class PagePath:
     def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
         """Update the judgement; return whether the page is behind.
 
-        Args:
-            now_ns: The current time.
-            extra_s: Time that pictures take to reach the cockpit [s].
+        ``extra_s``: time that pictures take to reach the cockpit [s].
         """
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
@@ -114,13 +112,8 @@ class Sent:
 class PageStream:
     """One camera for one page.
 
-    Args:
-        station: The drone.
-        camera: The camera.
-        width: Of the pane [device pixels]; 0: full size.
-        max_fps: Most pictures a second; None: all.
-        wake: Called on the event loop for each picture; None: the page polls.
-        clock: The monotonic clock [ns].
+    ``width``: of the pane [device pixels]; 0: full size. ``max_fps``: most pictures a second; None: all. ``wake``:
+    called on the event loop for each picture; None: the page polls.
     """
 
     def __init__(

@@ -41,12 +41,7 @@ RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
     """Return a drone's surroundings for maps. This queries its proxy and waits for the answers.
 
-    Args:
-        drone: The drone.
-        given: The scenery for a drone that does not report any.
-
-    Raises:
-        LinkError: The proxy does not answer.
+    ``given``: the scenery for a drone that does not report any.
     """
     read = _reader(drone)
     known = _known(read(WORLD))
@@ -65,12 +60,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
     """Return the proxy's objections to flying straight to a place from the drone's position.
 
-    Args:
-        drone: The drone.
-        place: The place, in world axes [m].
-
-    Raises:
-        LinkError: The proxy does not answer.
+    ``place``: the place, in world axes [m].
     """
     read = _reader(drone)
 
@@ -185,10 +175,7 @@ MAX_ASKING: Final = 4  #: simultaneous requests to drones; each may block its th
 class WorldApi:
     """The routes ``world``, ``way`` and ``preflight`` of each drone.
 
-    Args:
-        fleet: The drones.
-        recordings: The recordings of the same drones.
-        given: The surroundings of drones that don't report any.
+    ``given``: the surroundings of drones that don't report any.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:

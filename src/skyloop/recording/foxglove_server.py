@@ -349,8 +349,7 @@ class ParameterAccess:
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
         """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not answer.
 
-        Raises:
-            SkyloopError: A drone does not answer.
+        Raise ``SkyloopError`` if a drone does not answer.
         """
         wanted = set(names)
         of = {name.partition("/")[0] for name in wanted} if wanted else self._drones.keys()
@@ -458,16 +457,7 @@ def hidden_host() -> str:
 class OriginGuard:
     """Listens until :meth:`close` and forwards connections from trusted origins to the server.
 
-    Args:
-        host: Address to listen on.
-        port: Port to listen on; 0 picks a free one.
-
-    Attributes:
-        port: The port it listens on.
-        behind: Address and port of the server behind it; set before the port is announced.
-
-    Raises:
-        OSError: Listening on the address failed.
+    ``port``: port to listen on; 0 picks a free one. Raise ``OSError`` if listening on the address failed.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -485,9 +475,10 @@ class OriginGuard:
 
             def handle_error(self, request: Any, client_address: Any) -> None: ...
 
+        #: address and port of the server behind it; set before the port is announced
         self.behind: tuple[str, int] = ("", 0)
         self._server = Server((host, port), Visitor)
-        self.port = int(self._server.server_address[1])
+        self.port = int(self._server.server_address[1])  #: the port it listens on
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
         )

@@ -128,11 +128,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
     @property
     def described(self) -> Capabilities:
-        """Decode the drone's capabilities.
-
-        Raises:
-            FileFormatError: They can't be decoded.
-        """
+        """Decode the drone's capabilities. Raise ``FileFormatError`` if they can't be decoded."""
         return from_plain(self.capabilities, Capabilities)
 
 
@@ -166,11 +162,7 @@ def to_metadata(record: msgspec.Struct) -> dict[str, str]:
 
 
 def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
-    """Convert strings back to a metadata record.
-
-    Raises:
-        FileFormatError: The strings do not match the record.
-    """
+    """Convert strings back to a metadata record. Raise ``FileFormatError`` if the strings do not match the record."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     try:

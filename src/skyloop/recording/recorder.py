@@ -55,9 +55,8 @@ class Engine:
     ) -> None:
         """Initialise the recorder without opening a file. ``on_event`` is called on the writing thread.
 
-        Raises:
-            UsageError: Two drones have the same name.
-            UnknownNameError: No drone has a camera named in the options.
+        Raise ``UsageError`` if two drones have the same name, or ``UnknownNameError`` if no drone has a camera named in
+        the options.
         """
         check_names(drones, "recording")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
@@ -84,9 +83,8 @@ class Engine:
     def start(self) -> None:
         """Open the file and start recording.
 
-        Raises:
-            UsageError: The file can't be written.
-            SkyloopError: Subscribing to a drone failed; the file has been closed.
+        Raise ``UsageError`` if the file can't be written, or ``SkyloopError`` if subscribing to a drone failed; the
+        file has been closed.
         """
         self._writer.start()
         try:
@@ -407,10 +405,8 @@ class RecorderProcess:
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
         """Start the child and wait until it records. ``on_event`` is called on the thread that reads its events.
 
-        Raises:
-            UsageError: The child can't record because an argument is invalid.
-            LinkError: The child can't record for another reason, or has ended.
-            NoAnswerError: The child does not start in time.
+        Raise ``UsageError`` if the child can't record because an argument is invalid, ``LinkError`` if the child can't
+        record for another reason, or has ended, or ``NoAnswerError`` if the child does not start in time.
         """
         self._on_event = on_event
         self._status = Status(path=order.path)
@@ -485,11 +481,7 @@ class RecorderProcess:
 
 
 def check_installed() -> None:
-    """Check that the extra is installed, so that the error is raised here rather than in a child.
-
-    Raises:
-        MissingExtraError: The extra ``[record]`` is not installed.
-    """
+    """Check that the extra is installed, so that the error is raised here rather than in a child."""
     from importlib.util import find_spec
 
     missing = [name for name in ("mcap", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]

@@ -313,12 +313,7 @@ class RerunLog:
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
         """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
-        Args:
-            drones: Drones whose samples will be added.
-            recording: Name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
-
-        Raises:
-            MissingExtraError: The extra ``[rerun]`` is not installed.
+        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
@@ -328,11 +323,7 @@ class RerunLog:
         self._shown = drones
 
     def save(self, path: Path) -> None:
-        """Write to a file.
-
-        Raises:
-            UsageError: The file can't be written.
-        """
+        """Write to a file. Raise ``UsageError`` if the file can't be written."""
         try:
             self._stream.save(str(path), default_blueprint=self._blueprint())
         except (OSError, RuntimeError, ValueError) as error:
@@ -342,8 +333,7 @@ class RerunLog:
     def connect(self, url: str) -> None:
         """Send to a viewer or a server, at an address such as ``rerun+http://127.0.0.1:9876/proxy``.
 
-        Raises:
-            UsageError: The address is invalid.
+        Raise ``UsageError`` if the address is invalid.
         """
         try:
             self._stream.connect_grpc(url, default_blueprint=self._blueprint())
@@ -370,8 +360,7 @@ class RerunLog:
     def close(self, timeout_s: float = 5.0) -> None:
         """Finish the file, or send the remaining data to the viewer, waiting up to ``timeout_s`` [s].
 
-        Raises:
-            LinkError: The viewer did not accept the remaining data, which are dropped.
+        Raise ``LinkError`` if the viewer did not accept the remaining data, which are dropped.
         """
         if self.taken(timeout_s):
             self._stream.disconnect()
@@ -589,11 +578,7 @@ def part(name: str) -> str:
 
 
 def rerun_sdk() -> Any:
-    """Return Rerun's module.
-
-    Raises:
-        MissingExtraError: The extra ``[rerun]`` is not installed.
-    """
+    """Return Rerun's module."""
     try:
         import rerun
     except ImportError as error:

@@ -52,8 +52,7 @@ Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
 def check_names(drones: Sequence[Drone], of: str) -> None:
     """Check that the drones in a recording or view have distinct names.
 
-    Raises:
-        UsageError: Two drones have the same name.
+    Raise ``UsageError`` if two drones have the same name.
     """
     names = [drone.name for drone in drones]
     if len(set(names)) < len(names):
@@ -344,11 +343,7 @@ class Video:
 
 
 def encoder(options: Options) -> Encode:
-    """Return a function that encodes images of shape (height, width, 3), BGR, or (height, width); uint8.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    """Return a function that encodes images of shape (height, width, 3), BGR, or (height, width); uint8."""
     try:
         import cv2
     except ImportError as error:
@@ -452,22 +447,16 @@ class Screen(Protocol):
 
 
 class View:
-    """Shows drones on a screen from :meth:`start` to :meth:`close`. Use it as a context manager.
-
-    Attributes:
-        failed: Number of samples that could not be shown.
-        failed_why: Channel and error of the last one.
-    """
+    """Shows drones on a screen from :meth:`start` to :meth:`close`. Use it as a context manager."""
 
     def __init__(self, drones: Sequence[Drone], screen: Screen) -> None:
         """Initialise without subscribing. The view closes the screen.
 
-        Raises:
-            UsageError: Two drones have the same name.
+        Raise ``UsageError`` if two drones have the same name.
         """
         check_names(drones, "view")
-        self.failed = 0
-        self.failed_why = ""
+        self.failed = 0  #: number of samples that could not be shown
+        self.failed_why = ""  #: channel and error of the last one
         self._drones = drones
         self._screen = screen
         self._backlog = Backlog(_LIMIT, _RESERVE)

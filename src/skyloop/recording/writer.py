@@ -65,11 +65,7 @@ Opener = Callable[[Path, bool], Target]
 
 
 def open_target(path: Path, overwrite: bool) -> Target:
-    """Open a file for unbuffered writing.
-
-    Raises:
-        OSError: The file already exists, or can't be written.
-    """
+    """Open a file for unbuffered writing. Raise ``OSError`` if the file already exists, or can't be written."""
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
@@ -95,8 +91,7 @@ class Output:
     def flush(self) -> None:
         """Write the waiting data to the file.
 
-        Raises:
-            OSError: The disk fails; the file still ends where it did before.
+        Raise ``OSError`` if the disk fails; the file still ends where it did before.
         """
         try:
             for piece in self._pieces:
@@ -117,11 +112,6 @@ class RecordingFile:
     """An MCAP file being written; :meth:`commit` makes the messages part of the file.
 
     Every method raises ``OSError`` if the disk fails; after that, only :meth:`abandon` may be called.
-
-    Attributes:
-        path: The file.
-        written: Number of messages by topic.
-        count: Total number of messages.
     """
 
     def __init__(
@@ -129,16 +119,14 @@ class RecordingFile:
     ) -> None:
         """Create the file and write its metadata. ``clock`` relates monotonic to Unix time.
 
-        Raises:
-            OSError: The file can't be created or written.
-            MissingExtraError: The extra ``[record]`` is not installed.
+        Raise ``OSError`` if the file can't be created or written.
         """
         try:
             from mcap.writer import CompressionType, Writer
         except ImportError as error:
             raise MissingExtraError("recording", "record", cause=str(error)) from None
-        self.path = path
-        self.written: Counter[str] = Counter()
+        self.path = path  #: the file
+        self.written: Counter[str] = Counter()  #: number of messages by topic
         self.count = 0  #: total number of messages
         self._target = opener(path, overwrite)
         self._output = Output(self._target)
@@ -211,28 +199,12 @@ class RecordingFile:
 
 
 def free_space(folder: Path) -> int:
-    """Return the free bytes on a folder's disk.
-
-    Raises:
-        OSError: The disk can't be read.
-    """
+    """Return the free bytes on a folder's disk. Raise ``OSError`` if the disk can't be read."""
     return shutil.disk_usage(folder).free
 
 
 class FileWriter:
-    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread.
-
-    Attributes:
-        state: State of the recorder.
-        reason: Why the recorder is paused or has failed.
-        files: All files, oldest first.
-        room: Which samples to write, given the space left on the disk.
-        unwritable: Samples that could not be translated.
-        unwritable_why: Channel and error of the last one.
-        dropped: Returns the totals of dropped samples by drone and channel, for the end of each file.
-        missed: Returns the totals of missed samples by drone and channel, for the end of each file.
-        each_second: Called each second on the writing thread.
-    """
+    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread."""
 
     def __init__(
         self,
@@ -248,15 +220,16 @@ class FileWriter:
         free: Callable[[Path], int] = free_space,
     ) -> None:
         """Initialise without opening a file. ``tell`` runs on the writing thread, or at first on :meth:`start`'s."""
-        self.state = RecorderState.STARTING
-        self.reason = ""
-        self.files: list[Path] = []
-        self.room = Room.ALL
+        self.state = RecorderState.STARTING  #: state of the recorder
+        self.reason = ""  #: why the recorder is paused or has failed
+        self.files: list[Path] = []  #: all files, oldest first
+        self.room = Room.ALL  #: which samples to write, given the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last one
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
+        #: returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
-        self.each_second: Callable[[], None] = lambda: None
+        self.each_second: Callable[[], None] = lambda: None  #: called each second on the writing thread
         self._path = path
         self._options = options
         self._backlog = backlog
@@ -281,8 +254,7 @@ class FileWriter:
     def start(self) -> None:
         """Open the first file and start the thread.
 
-        Raises:
-            UsageError: The file can't be written, or the disk is too full.
+        Raise ``UsageError`` if the file can't be written, or the disk is too full.
         """
         folder = self._path.parent
         try:

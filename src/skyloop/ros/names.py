@@ -29,15 +29,10 @@ _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree.
+    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree."""
 
-    Attributes:
-        drone: The drone's name, as a valid ROS 2 name.
-        map: The frame in which all drones' ``odom`` have the same origin; empty: none.
-    """
-
-    drone: str
-    map: str = ""
+    drone: str  #: the drone's name, as a valid ROS 2 name
+    map: str = ""  #: the frame in which all drones' ``odom`` have the same origin; empty: none
 
     @property
     def odom(self) -> str:
@@ -57,8 +52,7 @@ class Frames:
 def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
     """Return each drone's namespace, without a slash.
 
-    Raises:
-        UsageError: Two drones would have the same namespace.
+    Raise ``UsageError`` if two drones would have the same namespace.
     """
     found: dict[str, str] = {}
     for name in drones:
@@ -130,8 +124,7 @@ _kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of
 def tf_message_type() -> type:
     """Return a type for a publisher of transforms that sends ready-made bytes.
 
-    Raises:
-        UnsupportedError: The message's package is not installed, and this version of rclpy is not supported.
+    Raise ``UnsupportedError`` if the message's package is not installed, and this version of rclpy is not supported.
     """
     try:
         installed: type = import_module("tf2_msgs.msg").TFMessage

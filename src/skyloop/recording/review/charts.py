@@ -327,11 +327,7 @@ class Page:
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 
     def write(self, path: Path) -> None:
-        """Write the page.
-
-        Raises:
-            UsageError: The file can't be written.
-        """
+        """Write the page. Raise ``UsageError`` if the file can't be written."""
         write(path, self.html().encode())
 
     def html(self) -> str:

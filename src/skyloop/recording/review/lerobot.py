@@ -240,9 +240,7 @@ def _info(whole: Sequence[Episode], form: Form, tasks: Sequence[str], films: Map
 class _Writer:
     """Writes the files of a dataset into a folder that is new or empty.
 
-    Raises:
-        UsageError: The folder is not empty.
-        MissingExtraError: PyArrow is not installed.
+    Raise ``UsageError`` if the folder is not empty.
     """
 
     def __init__(self, folder: Path) -> None:

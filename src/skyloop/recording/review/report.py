@@ -62,8 +62,7 @@ def write_report(
 ) -> None:
     """Write the report with up to ``pictures`` key frames per camera. This reads the recording three times.
 
-    Raises:
-        UsageError: The file can't be written.
+    Raise ``UsageError`` if the file can't be written.
     """
     report_progress = progress or (lambda _: None)
     summary = summarise(recording, lambda share: report_progress(share / 3))

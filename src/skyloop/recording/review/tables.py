@@ -259,11 +259,7 @@ def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
-    """Write ``CHANNEL.parquet`` for each table; unknown values are null.
-
-    Raises:
-        MissingExtraError: PyArrow is not installed.
-    """
+    """Write ``CHANNEL.parquet`` for each table; unknown values are null."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -292,11 +288,7 @@ def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
 def read(
     recording: Recording, drone: str, channels: Collection[Channel] | None, progress: Progress | None = None
 ) -> dict[str, Table]:
-    """Read the tables to export.
-
-    Raises:
-        FileFormatError: The recording has none of these channels.
-    """
+    """Read the tables to export. Raise ``FileFormatError`` if the recording has none of these channels."""
     found = tables(recording, drone, channels or TABLES, progress)
     if not found:
         raise FileFormatError(f"{recording.path} holds none of these channels of {drone}")
