@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 from rich.table import Table
 
-from skyloop.cli.text import console, named, progress_bar
+from skyloop.cli.text import console, named, print_json, progress_bar
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def bench(
             simulator = measuring.measure_sim(seconds, progress)
             results, shown = simulator, [physics_table(simulator), drawing_table(simulator)]
     if json:
-        typer.echo(msgspec.json.encode(results).decode())
+        print_json(results)
     else:
         for table in shown:
             console().print(table)

@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
@@ -22,6 +21,9 @@ from skyloop.cli.naming import (
     KeysOption,
     NetworkOption,
     OptionalNameArgument,
+    PriorityOption,
+    SecondsOption,
+    WaitOption,
     drone_names,
     join_network,
     one_drone,
@@ -68,13 +70,9 @@ def fly(
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    seconds: SecondsOption = None,
+    priority: PriorityOption = 16,
+    wait: WaitOption = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
         bool, typer.Option("--reload", help="Reload the file when saved; after an error, hover until then")
@@ -341,9 +339,7 @@ class FlightProgress:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         if self._live is not None:
             self._live.stop()
@@ -418,13 +414,9 @@ def fly_follow(
         float | None, typer.Option(metavar="M", help="Maximum distance from its start [default: no limit]")
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    seconds: SecondsOption = None,
+    priority: PriorityOption = 16,
+    wait: WaitOption = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, if it is on the ground")] = True,
     network: NetworkOption = None,
     keys: KeysOption = None,

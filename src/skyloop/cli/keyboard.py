@@ -12,7 +12,6 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from skyloop.errors import UnsupportedError, UsageError
@@ -304,9 +303,7 @@ class Keyboard:
         )  # a shell has set its own mode in the meantime
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         signal.signal(signal.SIGCONT, self._continued)
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
 

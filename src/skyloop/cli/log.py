@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from skyloop.cli.naming import recordings
-from skyloop.cli.text import console, named, progress_bar, tell
+from skyloop.cli.text import console, named, print_json, progress_bar, tell
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UsageError
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skyloop.recording.layout import Channel
     from skyloop.recording.reader import Described, Recording
     from skyloop.recording.review.compare import Comparison
-    from skyloop.recording.review.summary import Delay, Recovered, Row, Summary
+    from skyloop.recording.review.summary import Delay, Row, Summary
     from skyloop.recording.review.video import Videos
 
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -75,7 +75,9 @@ def info(
     with progress_bar("reading") as progress:
         summary = summarise(recording, progress)
     if json:
-        typer.echo(_as_json(recording, summary))
+        started_ns = recording.start.started_unix_ns
+        head = {"file": recording.path, "drones": recording.drones, "started_unix_ns": started_ns}
+        print_json(head | {"summary": summary})
         return
     screen = console()
     for part in info_parts(recording, summary):
@@ -97,7 +99,7 @@ def list_recordings(
     rows = [(path, describe(path)) for path in paths]
     if json:
         found = [{"name": shown_name(path), **msgspec.structs.asdict(summary)} for path, summary in rows]
-        typer.echo(msgspec.json.encode(found).decode())
+        print_json(found)
     elif rows:
         console().print(_listing(rows))
     else:
@@ -224,7 +226,8 @@ def compare(
     older, newer = _open(old), _open(new)
     found = commands_of(older, newer, drone=drone, what=what.value, part=part)
     if json:
-        typer.echo(_comparison_json(found))
+        names = ("aligned", "seconds", "same_action", "fields", "part_at_s", "counts")
+        print_json({name: getattr(found, name) for name in names})
     else:
         screen = console()
         for part_ in _comparison(found, str(old), str(new)):
@@ -253,13 +256,13 @@ def recover(
     if not wrong and output is None:
         tell(f"{file} is complete: there is nothing to repair")
         if json:
-            typer.echo(_recovered_json(file, None))
+            print_json({"file": file, "saved": None})
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
     with progress_bar("mending") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
-        typer.echo(_recovered_json(file, saved))
+        print_json({"file": file, "saved": saved})
         return
     for problem in saved.why:
         tell(f"{file}: {problem}")
@@ -378,12 +381,6 @@ def _listing(rows: Sequence[tuple[Path, Described]]) -> Table:
     return table
 
 
-def _as_json(recording: Recording, summary: Summary) -> str:
-    """Return the output of ``skyloop log info --json``."""
-    head = {"file": str(recording.path), "drones": recording.drones, "started_unix_ns": recording.start.started_unix_ns}
-    return msgspec.json.encode(head | {"summary": summary}, enc_hook=str).decode()
-
-
 def _head(recording: Recording, summary: Summary) -> Table:
     table = Table.grid(padding=(0, 2))
     start = recording.start
@@ -440,11 +437,6 @@ def _losses(summary: Summary) -> Iterator[str]:
                 yield f"{drone}: {words} {what}"
 
 
-def _recovered_json(file: Path, saved: Recovered | None) -> str:
-    """Return the output of ``skyloop log recover --json``; ``saved`` is null if the recording was complete."""
-    return msgspec.json.encode({"file": str(file), "saved": saved}, enc_hook=str).decode()
-
-
 def _exported(found: Videos, camera: str) -> Iterator[str]:
     """Yield a line for each exported video, and one about missing frames."""
     for video in found.videos:
@@ -454,14 +446,6 @@ def _exported(found: Videos, camera: str) -> Iterator[str]:
     if found.left_out:
         why = "of another size" if not found.videos[0].copied else "without the frames they depend on"
         yield f"{found.left_out} frames were skipped: damaged, or {why}"
-
-
-def _comparison_json(found: Comparison) -> str:
-    """Return the output of ``skyloop log compare --json``."""
-    shown = {
-        name: getattr(found, name) for name in ("aligned", "seconds", "same_action", "fields", "part_at_s", "counts")
-    }
-    return msgspec.json.encode(shown).decode()
 
 
 def _comparison(found: Comparison, old: str, new: str) -> list[str | Table]:

@@ -14,11 +14,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 
 from skyloop.cli.naming import MULTICAST, keys_directory, network_places
-from skyloop.cli.text import columns, tell
+from skyloop.cli.text import columns, print_json, tell
 from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.errors import UsageError
 from skyloop.files import expand
@@ -294,12 +293,11 @@ def show(
     now = datetime.now(UTC)
     if json:
         head = {"lab": roster.lab, "expires": int(authority.expires.timestamp()), "number": roster.number}
-        typer.echo(msgspec.json.encode(head | {"keys": roster.entries}).decode())
+        print_json(head | {"keys": roster.entries})
     else:
         typer.echo(f"{roster.lab}, valid until {_day(authority.expires)}; roster number {roster.number}")
         rows = [(e.name, e.role, ",".join(e.drones), _day(e.expires_at), _state(e, now)) for e in roster.entries]
-        for line in columns([("NAME", "ROLE", "DRONES", "VALID UNTIL", "STATE"), *rows]):
-            typer.echo(line)
+        typer.echo("\n".join(columns([("NAME", "ROLE", "DRONES", "VALID UNTIL", "STATE"), *rows])))
     ends = [("the lab's authority", authority.expires)]
     ends += [(f"the key of {entry.name}", entry.expires_at) for entry in roster.entries if not entry.revoked]
     for what, end in ends:

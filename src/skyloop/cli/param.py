@@ -16,7 +16,7 @@ from skyloop.cli.naming import (
     one_drone,
     parameter_names,
 )
-from skyloop.cli.text import columns
+from skyloop.cli.text import columns, print_json
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
 
@@ -65,10 +65,9 @@ def param(
         key, value = key.split("=", 1)
     found = _write(name, key, value, priority) if key is not None and value is not None else _read(name, key)
     if json:
-        typer.echo(msgspec.json.encode([msgspec.structs.asdict(each) for each in found]).decode())
+        print_json([msgspec.structs.asdict(each) for each in found])
         return
-    for line in details(found[0]) if [each.name for each in found] == [key] else table(found):
-        typer.echo(line)
+    typer.echo("\n".join(details(found[0]) if [each.name for each in found] == [key] else table(found)))
 
 
 def _read(name: str, key: str | None) -> list[Parameter]:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import msgspec
 import typer
 
 from skyloop.cli import interrupt_by_signals
@@ -21,11 +20,12 @@ from skyloop.cli.naming import (
     DroneOption,
     KeysOption,
     NetworkOption,
+    SecondsOption,
     drone_names,
     join_network,
     one_drone,
 )
-from skyloop.cli.text import tell
+from skyloop.cli.text import json_text, tell
 from skyloop.clock import beats
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.relayed import Polyline, Shape, Text
@@ -63,9 +63,7 @@ def process(
     stuck: Annotated[
         float, typer.Option(metavar="S", min=0.05, help="After this long on one frame, its share goes to others")
     ] = 2.0,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
     network: NetworkOption = None,
@@ -176,7 +174,7 @@ def show_text(status: Status) -> str:
 
 def show_json(status: Status) -> str:
     """Return a line for programs."""
-    return msgspec.json.encode(status).decode()
+    return json_text(status)
 
 
 def detect(
@@ -204,9 +202,7 @@ def detect(
     ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of the processor and its results")] = "detections",
     max_fps: Annotated[float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,

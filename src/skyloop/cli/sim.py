@@ -16,20 +16,7 @@ from urllib.parse import urlencode
 
 import typer
 
-from skyloop.cli.network import (
-    ConnectOption,
-    KeysOption,
-    ListenOption,
-    MakeEnd,
-    MetricsOption,
-    MulticastOption,
-    ServeOption,
-    key_changes,
-    metrics_beside,
-    server_ends,
-    settings_of,
-    warn_if_open,
-)
+from skyloop.cli import network as net
 from skyloop.errors import UsageError
 from skyloop.vehicles.sim.firmware import AutopilotKind
 
@@ -76,12 +63,12 @@ def sim(
             "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; repeat it to assign several to the drones in turn",
         ),
     ] = None,
-    network: ServeOption = None,
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    multicast: MulticastOption = True,
-    keys: KeysOption = None,
-    metrics: MetricsOption = None,
+    network: net.ServeOption = None,
+    listen: net.ListenOption = None,
+    connect: net.ConnectOption = None,
+    multicast: net.MulticastOption = True,
+    keys: net.KeysOption = None,
+    metrics: net.MetricsOption = None,
     firmware: Annotated[
         Firmware | None,
         typer.Option(
@@ -126,7 +113,6 @@ def sim(
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
     """
-    from skyloop.cli.network import settle
     from skyloop.drivers.uri import parse_uri
 
     chosen = [[f"autopilot={kind}"] for kind in autopilot] if autopilot else [[]]
@@ -146,12 +132,12 @@ def sim(
         given = [word for word, value in settings.items() if value is not None]
         if given:
             raise UsageError(f"{given[0]} is for --firmware: give --firmware {Firmware.ARDRONE2} as well")
-        network_settings = settings_of(network, listen, connect, multicast, keys)
-        settle(options)
+        network_settings = net.settings_of(network, listen, connect, multicast, keys)
+        net.settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
-        warn_if_open(network_settings, names)
-        look, beside = key_changes(network_settings), metrics_beside(metrics)
-        _serve_proxies(uris, options, names, server_ends(network_settings), look, beside)
+        net.warn_if_open(network_settings, names)
+        look, beside = net.key_changes(network_settings), net.metrics_beside(metrics)
+        _serve_proxies(uris, options, names, net.server_ends(network_settings), look, beside)
         return
     if metrics is not None:
         raise UsageError("--metrics is for proxies, and with --firmware there is none: leave it out")
@@ -162,7 +148,7 @@ def sim(
     _refuse_for_firmware(name, uri)
     from skyloop.vehicles.ardrone.emulator import Faults
 
-    settle(options)
+    net.settle(options)
     faults = Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0)
     serve(options, drones, firmware, Serving(bind or LOOPBACK, port_base, faults, delay or 0.0, video_port))
 
@@ -196,7 +182,7 @@ def _serve_proxies(
     uris: list[VehicleUri],
     options: SimOptions,
     names: list[str],
-    make_end: MakeEnd,
+    make_end: net.MakeEnd,
     look: Callable[[], list[str]] | None,
     beside: Beside | None,
 ) -> None:

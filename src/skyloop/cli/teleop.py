@@ -14,7 +14,16 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli.keyboard import KEY_MAP, TELL_FOCUS, TELL_NO_FOCUS, Deflection, Hands, Keyboard, Order
-from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
+from skyloop.cli.naming import (
+    AnyNameArgument,
+    DroneOption,
+    KeysOption,
+    NetworkOption,
+    PriorityOption,
+    WaitOption,
+    join_network,
+    one_drone,
+)
 from skyloop.errors import AuthorityError, SkyloopError
 from skyloop.extend import Known, commands, let_go
 from skyloop.messages import LinkState
@@ -35,10 +44,8 @@ def teleop(
     drone: DroneOption = None,
     speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Speed of a held key")] = 0.5,
     turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turn rate of a held key")] = 0.8,
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    priority: PriorityOption = 16,
+    wait: WaitOption = 0.0,
     cockpit: Annotated[bool, typer.Option("--cockpit", help="Also serve a page that shows the video")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,

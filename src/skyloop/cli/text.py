@@ -57,6 +57,18 @@ def tell(text: str) -> None:
     typer.echo(text, err=True)
 
 
+def print_json(value: Any) -> None:
+    """Print a value as one JSON document on standard output."""
+    typer.echo(json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """Return a value as JSON; what JSON has no form for, such as a path, becomes text."""
+    import msgspec
+
+    return msgspec.json.encode(value, enc_hook=str).decode()
+
+
 def coloured(line: str, stream: TextIO | None) -> str:
     """Return a line with its beginning coloured, if that has a meaning and the stream shows colours.
 

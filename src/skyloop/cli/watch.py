@@ -18,8 +18,16 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
-from skyloop.cli.text import named
+from skyloop.cli.naming import (
+    DroneOption,
+    KeysOption,
+    NameArgument,
+    NetworkOption,
+    SecondsOption,
+    join_network,
+    one_drone,
+)
+from skyloop.cli.text import json_text, named
 from skyloop.messages import Event, Failsafe, Feedback, ReturnPhase, Severity
 
 if TYPE_CHECKING:
@@ -36,9 +44,7 @@ COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ER
 def watch(
     name: NameArgument = None,
     drone: DroneOption = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: SecondsOption = None,
     video: Annotated[bool, typer.Option(help="Request the first camera's frames, to show their rate and age")] = True,
     json: Annotated[
         bool, typer.Option("--json", help="Print JSON lines, one each second and one for each event")
@@ -121,11 +127,11 @@ def event_line(event: Event) -> str:
 
 def _state_json(drone: Drone) -> str:
     shown = {"feedback": msgspec.structs.asdict(drone.feedback()), "link": drone.link, "stats": drone.stats}
-    return msgspec.json.encode(shown).decode()
+    return json_text(shown)
 
 
 def _event_json(event: Event) -> str:
-    return msgspec.json.encode({"event": msgspec.structs.asdict(event)}).decode()
+    return json_text({"event": msgspec.structs.asdict(event)})
 
 
 # The live picture ----------------------------------------------------------------------------------------------

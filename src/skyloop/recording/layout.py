@@ -30,35 +30,7 @@ from skyloop.messages import (
 )
 from skyloop.recording.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 
-__all__ = [
-    "Channel",
-    "ClockPair",
-    "DroneRecord",
-    "Drops",
-    "End",
-    "FrameRecord",
-    "ResultRecord",
-    "Start",
-    "TYPES",
-    "Topic",
-    "calibration_topic",
-    "decode",
-    "drawing_topic",
-    "encode",
-    "from_metadata",
-    "from_plain",
-    "image_topic",
-    "optical_frame",
-    "parse_topic",
-    "path_topic",
-    "mocap_topic",
-    "pose_topic",
-    "schema",
-    "schema_name",
-    "to_metadata",
-    "to_plain",
-    "video_topic",
-]
+__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # from plain, for other modules
 
 T = TypeVar("T")
 

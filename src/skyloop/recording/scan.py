@@ -53,25 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = [
-    "AttachmentIndex",
-    "Channel",
-    "Message",
-    "Metadata",
-    "MetadataIndex",
-    "Opcode",
-    "Piece",
-    "ReadDataStream",
-    "Record",
-    "Scan",
-    "Schema",
-    "attachments",
-    "find_channels",
-    "note",
-    "open_file",
-    "records",
-    "scan",
-]
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
