@@ -9,7 +9,7 @@ import asyncio
 import math
 from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -19,7 +19,7 @@ from skyloop.errors import SkyloopError, UnknownNameError
 from skyloop.messages import Event, EventKind, Failsafe, Feedback, FlightState, LinkState, ReturnPhase, Value
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone, LinkStatus
+    from skyloop.client import Config, Drone, LinkStatus
 
 _Make = Callable[[str, str], "Alarm"]
 _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
@@ -158,12 +158,6 @@ PARAMETERS: Final = {
 }
 
 
-class _Readable(Protocol):
-    """The part of ``drone.config`` that is used here."""
-
-    def __getitem__(self, name: str, /) -> Value: ...
-
-
 class ThresholdReader:
     """Reads the thresholds, and reads them again after a parameter was written or a link was restored.
 
@@ -208,12 +202,12 @@ class ThresholdReader:
             self._task = None
 
 
-def thresholds_of(config: _Readable) -> Thresholds:
+def thresholds_of(config: Config | Mapping[str, Value]) -> Thresholds:
     """Read the thresholds; use the default for any that the proxy lacks or that is not finite."""
     return msgspec.structs.replace(USUAL, **{field: _number(config, name, field) for field, name in PARAMETERS.items()})
 
 
-def _number(config: _Readable, name: str, field: str) -> float:
+def _number(config: Config | Mapping[str, Value], name: str, field: str) -> float:
     usual: float = getattr(USUAL, field)
     try:
         value = config[name]

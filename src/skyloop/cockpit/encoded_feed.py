@@ -20,7 +20,7 @@ import msgspec
 
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.cockpit.feeds import Cancellable, Wake, call_soon
+from skyloop.cockpit.feeds import Wake, call_soon
 from skyloop.extend import stream_channel
 from skyloop.messages import CameraInfo, EncodedFrame
 
@@ -75,7 +75,7 @@ class CameraFeed:
         self._drone = drone
         self._clock = clock
         self._since_ns = 0  # when the first page subscribed
-        self._listener: Cancellable | None = None
+        self._listener: Listener[Any] | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
         self._jpeg: tuple[int, asyncio.Future[bytes]] | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
@@ -18,7 +18,7 @@ from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyl
 from skyloop.messages.relayed import MOCAP as SERIES
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone
+    from skyloop.client import Drone, Listener
 
 ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
@@ -37,12 +37,6 @@ _encode = msgspec.json.Encoder().encode
 
 K = TypeVar("K")
 V = TypeVar("V")
-
-
-class Cancellable(Protocol):
-    """The result of registering a callback with a drone."""
-
-    def cancel(self) -> None: ...
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
@@ -206,7 +200,7 @@ class EventFeed:
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
         self._waking = False  # a wake-up of the pages has been scheduled
-        self._listeners: list[Cancellable] = [
+        self._listeners: list[Listener[Any]] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
@@ -258,7 +252,7 @@ class LogFeed:
         self._numbers: Newest[str, float] = Newest(MAX_SERIES, clock)
         self._waypoints: tuple[int, tuple[tuple[float, ...], ...]] | None = None
         self._mocap: tuple[int, tuple[float, ...]] | None = None
-        self._listeners: list[Cancellable] = []
+        self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
         """Subscribe; or unsubscribe and forget the values."""

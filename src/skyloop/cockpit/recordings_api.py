@@ -28,7 +28,9 @@ _REPORT_POLICY: Final = (
 )
 #: A replay's parameters, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = 16_384  #: maximum length of any text in a request; each use has a lower limit and reports it
+_MOST_CHARACTERS: Final = (
+    16_384  #: maximum length of a name or a text in a request; each use has a lower limit and reports it
+)
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -42,11 +44,6 @@ class _Name(msgspec.Struct):
 
 class _Words(msgspec.Struct):
     text: _Text
-
-
-class _Mark(msgspec.Struct):
-    at_s: float
-    text: _Text = ""
 
 
 class _Replay(msgspec.Struct):
@@ -151,16 +148,14 @@ class RecordingsApi:
     @answered
     async def add_mark(self, request: Request) -> Response:
         """Add a mark to a recording."""
-        mark = await body_of(request, _Mark)
+        mark = await body_of(request, recording_files.Mark)
         return await self._annotate(request, lambda path: recording_files.add_mark(path, mark.at_s, mark.text), 201)
 
     @answered
     async def remove_mark(self, request: Request) -> Response:
         """Remove a mark from a recording."""
-        mark = await body_of(request, _Mark)
-        return await self._annotate(
-            request, lambda path: recording_files.remove_mark(path, recording_files.Mark(mark.at_s, mark.text))
-        )
+        mark = await body_of(request, recording_files.Mark)
+        return await self._annotate(request, lambda path: recording_files.remove_mark(path, mark))
 
     @answered
     async def rename(self, request: Request) -> Response:

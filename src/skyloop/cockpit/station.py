@@ -7,7 +7,7 @@ import logging
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.actions import OUTDONE, OVERRULED
@@ -15,7 +15,7 @@ from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import ThresholdReader
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, SmallFeed
-from skyloop.cockpit.feeds import ROW_HZ, Cancellable, EventFeed, LogFeed, PeriodicBroadcast
+from skyloop.cockpit.feeds import ROW_HZ, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.control.waypoint import Waypoint
@@ -25,6 +25,7 @@ from skyloop.messages import AnyAction, CameraInfo, EventKind, FlightState, Idle
 from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
+    from skyloop.client import Listener
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
@@ -170,7 +171,7 @@ class Station:
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
         drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # registered until the drone is closed
-        self._whole: Cancellable | None = None  # consumes all feedback while a page shows the drone
+        self._whole: Listener[Any] | None = None  # consumes all feedback while a page shows the drone
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
         self._stops = 0  # number of emergency stops in progress

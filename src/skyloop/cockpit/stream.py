@@ -12,18 +12,22 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, Numbered, form_for, pack
+from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, Numbered, SmallFrame, form_for, pack
 from skyloop.cockpit.feeds import PeriodicBroadcast, Wake
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.errors import SkyloopError
 from skyloop.messages import CameraInfo, EncodedFrame
+
+if TYPE_CHECKING:
+    from skyloop.client import Frame
+
 
 # One camera as H.264 on one page: its form and its pictures ---------------------------------------------------------
 #
@@ -549,16 +553,7 @@ def _said(text: str) -> _FromPage | None:
     return said if said.ack is not None or said.h264 is not None or said.key else None
 
 
-class Captured(Protocol):
-    """The part of a picture that pages are told about."""
-
-    @property
-    def seq(self) -> int: ...
-    @property
-    def captured_ns(self) -> int: ...
-
-
-def picture_values(picture: Captured, age_s: float, width: int, height: int) -> dict[str, Any]:
+def picture_values(picture: Frame | SmallFrame | EncodedFrame, age_s: float, width: int, height: int) -> dict[str, Any]:
     """Return a picture's description for pages, as JSON values."""
     captured = str(picture.captured_ns)  # too large for numbers in JavaScript
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}

@@ -66,14 +66,12 @@ class Schema:
         return cls(kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind), layout.PROTOBUF)
 
 
+@dataclass(slots=True, eq=False)
 class Picture:
     """A frame in the form written to the file."""
 
-    __slots__ = ("data", "record")
-
-    def __init__(self, record: FrameRecord, data: bytes) -> None:
-        self.record = record
-        self.data = data
+    record: FrameRecord
+    data: bytes
 
 
 class Path:
