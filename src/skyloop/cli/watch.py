@@ -102,7 +102,6 @@ def _live(drone: Drone, duration_s: float) -> None:
 
 
 def state_line(drone: Drone) -> str:
-    """Return the current state as a short line."""
     feedback, link = drone.feedback(), drone.link
     rates = [f"{name} {channel.rate_hz:.0f}/s" for name, channel in drone.stats.items() if channel.count > 1]
     parts = [
@@ -121,7 +120,6 @@ def state_line(drone: Drone) -> str:
 
 
 def event_line(event: Event) -> str:
-    """Return an event as a line."""
     return f"{time.strftime('%H:%M:%S')}  {event.severity.value}: {event.text}"
 
 
@@ -143,7 +141,6 @@ def picture(drone: Drone) -> Group:
 
 
 def state_panel(drone: Drone) -> Panel:
-    """Return a panel with the state of the drone and its links."""
     return Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left")
 
 

@@ -157,7 +157,6 @@ class Announcer:
         self._loopback = loopback
 
     def __call__(self, page: str) -> None:
-        """Print it."""
         print(f"cockpit: {page}", flush=True)
         if self._pairing is not None:
             self._pairing.on_used = lambda who: self._show(page, f"paired with {who}")

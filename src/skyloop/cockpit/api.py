@@ -99,7 +99,6 @@ async def _gone(request: Request) -> None:
 
 
 def answer_json(values: Any, status: int = 200) -> Response:
-    """Create an answer."""
     return Response(encode_json(values), status, media_type=_JSON)
 
 
@@ -158,7 +157,6 @@ class Api:
         self._scheme = scheme
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/session", self.session),
             Route("/api/login", self.login, methods=["POST"]),
@@ -307,7 +305,6 @@ class RoutesApi:
         self._checking = asyncio.Semaphore(MOST_CHECKS)
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/drones/{name}/route/check", self.check, methods=["POST"]),
             Route("/api/routes", self.listing),
@@ -345,7 +342,6 @@ class RoutesApi:
 
     @answered
     async def delete(self, request: Request) -> Response:
-        """Delete a route."""
         check_json(request)
         name = request.path_params["name"]
         await asyncio.to_thread(self._files.delete, name)

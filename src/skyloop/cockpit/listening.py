@@ -325,7 +325,6 @@ class RepeatLimit(logging.Filter):
         self._logged: dict[str, tuple[int, int]] = {}  # by message without values: time, number dropped since
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log a record."""
         key, now_ns = f"{record.name} {record.msg}", self._clock()
         logged_ns, left_out = self._logged.get(key, (None, 0))
         if logged_ns is not None and now_ns - logged_ns < self._every_ns:

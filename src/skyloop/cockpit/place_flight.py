@@ -86,7 +86,6 @@ class PlaceFlight:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a flight is under way."""
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
@@ -177,11 +176,9 @@ class RouteSession:
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
-        """Resume the flight."""
         self._ask(self.law.resume)
 
     def skip(self) -> None:
-        """Skip the current waypoint."""
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:

@@ -64,7 +64,6 @@ class RecordingsApi:
         self._recordings = recordings
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         one = "/api/recordings/{name}"
         return [
             Route("/api/recordings", self.recordings, methods=["GET"]),
@@ -96,7 +95,6 @@ class RecordingsApi:
 
     @answered
     async def record(self, request: Request) -> Response:
-        """Start a recording."""
         wanted = await body_of(request, _Wanted)
         for name in wanted.drones:
             self._fleet.station(name)
@@ -104,7 +102,6 @@ class RecordingsApi:
 
     @answered
     async def stop(self, request: Request) -> Response:
-        """Stop a recording."""
         check_json(request)
         return answer_json(await self._recordings.stop(request.path_params["number"]))
 
@@ -141,25 +138,21 @@ class RecordingsApi:
 
     @answered
     async def write_note(self, request: Request) -> Response:
-        """Write the note of a recording."""
         text = (await body_of(request, _Words)).text
         return await self._annotate(request, lambda path: recording_files.write_text(path, text))
 
     @answered
     async def add_mark(self, request: Request) -> Response:
-        """Add a mark to a recording."""
         mark = await body_of(request, recording_files.Mark)
         return await self._annotate(request, lambda path: recording_files.add_mark(path, mark.at_s, mark.text), 201)
 
     @answered
     async def remove_mark(self, request: Request) -> Response:
-        """Remove a mark from a recording."""
         mark = await body_of(request, recording_files.Mark)
         return await self._annotate(request, lambda path: recording_files.remove_mark(path, mark))
 
     @answered
     async def rename(self, request: Request) -> Response:
-        """Rename a recording."""
         new = (await body_of(request, _Name)).name
         recording_files.check_name(new)
         return await self._move(request, lambda path: recording_files.rename(path, new))
@@ -180,7 +173,6 @@ class RecordingsApi:
 
     @answered
     async def empty_trash(self, request: Request) -> Response:
-        """Empty the trash."""
         check_json(request)
         await self._recordings.in_trash(recording_files.empty_trash)
         return answer_json({})
@@ -189,7 +181,6 @@ class RecordingsApi:
 
     @answered
     async def replay(self, request: Request) -> Response:
-        """Replay a recording."""
         wanted = await body_of(request, _Replay)
         name = await self._recordings.replay(request.path_params["name"], wanted.drone)
         self._fleet.want(name)
@@ -220,7 +211,6 @@ class RecordingsApi:
 
     @answered
     async def end_replay(self, request: Request) -> Response:
-        """End a replay."""
         check_json(request)
         name = request.path_params["name"]
         await self._recordings.end_replay(name)

@@ -67,7 +67,6 @@ class KeptFrames:
             self.bytes -= self._frames.popleft().header.size
 
     def clear(self) -> None:
-        """Discard all frames."""
         self._frames.clear()
         self.bytes = 0
 
@@ -284,7 +283,6 @@ class TargetTracker:
         self._thread = threading.Thread(target=self._run, name="skyloop-follow", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:

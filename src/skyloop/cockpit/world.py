@@ -185,7 +185,6 @@ class WorldApi:
         self._asking = asyncio.Semaphore(MAX_ASKING)
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/drones/{name}/world", self.world),
             Route("/api/drones/{name}/way", self.way),

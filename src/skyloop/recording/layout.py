@@ -224,7 +224,6 @@ class Topic:
     camera: str = ""
 
     def __str__(self) -> str:
-        """Return the topic as a string."""
         return "/" + "/".join(map(_quoted, (self.drone, self.channel.value, *([self.camera] if self.camera else []))))
 
 

@@ -98,7 +98,6 @@ class Tap:
         self._parameters = Parameters(drone, self.put_parameter) if options.wants(Channel.PARAMETERS) else None
 
     def start(self) -> None:
-        """Subscribe."""
         drone, wants = self.drone, self._options.wants
         listen: tuple[tuple[Channel, Callable[..., Listener[Any]], Callable[[Any], None]], ...] = (
             (Channel.FEEDBACK, drone.on_feedback, self._feedback),
@@ -205,12 +204,10 @@ class Stream:
         self._sink = self._arrived
 
     def start(self) -> None:
-        """Subscribe."""
         self.newest_ns = time.monotonic_ns()
         self._topic.add(self._sink, lambda: 0)
 
     def stop(self) -> None:
-        """Unsubscribe."""
         self._topic.remove(self._sink)
 
     def _arrived(self, picture: EncodedFrame) -> None:
@@ -376,7 +373,6 @@ class Parameters:
         self._thread = threading.Thread(target=self._run, name="skyloop-record-parameters", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._wake.set()
         self._thread.start()
 
@@ -438,8 +434,7 @@ class Screen(Protocol):
     def wanted(self) -> frozenset[Source]:
         """Return the sources currently on display; only these are subscribed to."""
 
-    def show(self, item: Item) -> None:
-        """Show a sample."""
+    def show(self, item: Item) -> None: ...
 
     def close(self) -> None:
         """Close the screen. Called after the view's thread has ended."""
@@ -465,7 +460,6 @@ class View:
         self._thread = threading.Thread(target=self._run, name="skyloop-view", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:

@@ -156,7 +156,6 @@ class RecordingFile:
             return True
 
     def write(self, message: Message) -> None:
-        """Append a message."""
         channel = self._channels.get(message.topic)
         if channel is None:
             channel = self._add_channel(message)
@@ -483,7 +482,6 @@ class FileWriter:
             self._report(f"recording paused ({why}): data on disk is safe, new frames are dropped", Severity.ERROR)
 
     def _check_disk(self) -> None:
-        """Check the disk and the file."""
         file = self._file
         if file is not None and file.lost:
             self._pause(f"{file.path} was removed")

@@ -110,12 +110,6 @@ class _Callbacks(ctypes.Structure):
     )
 
 
-class _TypeHash(ctypes.Structure):
-    """``rosidl_type_hash_t`` of rosidl_runtime_c."""
-
-    _fields_ = (("version", ctypes.c_uint8), ("value", ctypes.c_uint8 * 32))
-
-
 _Find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 _Hash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 _kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of this process
@@ -164,7 +158,7 @@ def _borrowed() -> type:
     callbacks.namespace, callbacks.name = package.replace("/", "::").encode(), name.encode()
     support = _TypeSupport.from_buffer_copy(_TypeSupport.from_address(found))
     support.data = ctypes.addressof(callbacks)
-    type_hash = _TypeHash(1, (ctypes.c_uint8 * 32).from_buffer_copy(TYPE_HASH))
+    type_hash = ctypes.create_string_buffer(b"\x01" + TYPE_HASH, 33)  # rosidl_type_hash_t: version and 32 bytes
     address = ctypes.addressof(type_hash)
     get_hash = _Hash(lambda _: address)
     support.hash = ctypes.cast(get_hash, ctypes.c_void_p).value

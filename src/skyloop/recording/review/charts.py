@@ -308,7 +308,6 @@ class Page:
         self._way: list[Any] | None = None
 
     def add(self, html: str) -> None:
-        """Append HTML."""
         self._parts.append(html)
 
     def chart(self, title: str, unit: str, lines: Sequence[Line], limits: tuple[float, float]) -> None:
@@ -331,7 +330,6 @@ class Page:
         write(path, self.html().encode())
 
     def html(self) -> str:
-        """Return the whole page."""
         style, script = (
             files("skyloop.recording.review").joinpath("static", name).read_text("utf-8") for name in _FILES
         )

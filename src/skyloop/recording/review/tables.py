@@ -59,7 +59,6 @@ class Table:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """Return a column."""
         return self.columns[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
