@@ -250,16 +250,12 @@ class Api:
 
         See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts only the current cameras.
         """
-        counts = self._counts
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return answer_json(
             {
-                "pages": counts.pages,
-                "frames_sent": counts.frames_sent,
-                "frames_acknowledged": counts.frames_acknowledged,
-                "frames_skipped": counts.frames_skipped,
+                **asdict(self._counts),
+                "sources": sorted(self._counts.sources),
                 "frames_encoded": sum(feed.encoded for feed in feeds),
-                "sources": sorted(counts.sources),
                 "left_out": {
                     "drawings": sum(station.event_feed.drawings.refused for station in self._fleet.stations.values()),
                     "series": sum(station.log_feed.refused for station in self._fleet.stations.values()),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import socket
 import ssl
 import sys
 import threading
@@ -129,7 +128,7 @@ def serve_cockpit(
         raise MissingExtraError("the cockpit", "cockpit", cause=str(error)) from error
     from skyloop.cockpit.access import TokenGate
     from skyloop.cockpit.addresses import Announcer
-    from skyloop.cockpit.security import bind_address
+    from skyloop.cockpit.security import bind_address, own_names
 
     access = access or Access()
     address, loopback = bind_address(access.host)
@@ -140,19 +139,42 @@ def serve_cockpit(
             "port over SSH"
         )
     tls = None if access.tls_cert is None else _tls(access)
-    listening = bind(address, port)
-    try:
+    with ExitStack() as closing:
+        listening = bind(address, port)
+        closing.callback(listening.close)
         given = None if world is None else _geometry(world)
         gate = _gate(access, listening.getsockname()[1])
         finder = _finder(names, network)
-        try:
-            _check_names(names, finder)
-            announcer = Announcer(gate.pairing if isinstance(gate, TokenGate) else None, loopback)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop, given, metrics)
-        finally:
-            finder.close()
-    finally:
-        listening.close()
+        closing.callback(finder.close)
+        _check_names(names, finder)
+        pairing = gate.pairing if isinstance(gate, TokenGate) else None
+        ready = on_ready or Announcer(pairing, loopback)
+
+        from skyloop.cockpit.app import create_app
+        from skyloop.cockpit.fleet import Fleet
+        from skyloop.cockpit.recordings import Recordings
+        from skyloop.cockpit.target_tracker import warm_up
+
+        address, port = listening.getsockname()[:2]
+        own_name = () if bind_address(address)[1] else host_names()
+        hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
+        admission = Admission(places_here())
+        fleet = Fleet(finder, kept=names)
+        authority = None if access.page_authority is None else access.page_authority.read_bytes()
+        kept = Recordings(recordings)
+        app = create_app(fleet, kept, hosts, gate, admission=admission, world=given, page_authority=authority)
+        server = quiet_server(app)
+        seen_at = reachable(address)[0]
+        page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
+        listener = Listener(listening, admission, http_protocol(server, admission), tls)
+        if metrics is not None:
+            from skyloop.metrics import serve
+
+            endpoint = closing.enter_context(serve(lambda: fleet_sources(fleet), metrics))
+            print(endpoint.announcement, file=sys.stderr, flush=True)
+        expire_codes = _idle if pairing is None else pairing.expire
+        threading.Thread(target=warm_up, name="skyloop-warm-up").start()
+        asyncio.run(_run(server, listener, lambda: ready(page), stop, expire_codes))
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
@@ -257,51 +279,6 @@ def _tls(access: Access) -> ssl.SSLContext:
             raise UsageError(f"{access.client_ca} can't be used to check certificates: {error}") from None
         context.verify_mode = ssl.CERT_REQUIRED
     return context
-
-
-def _serve(
-    finder: Finder,
-    names: Sequence[str],
-    access: Access,
-    gate: Gate,
-    tls: ssl.SSLContext | None,
-    recordings: Path,
-    listening: socket.socket,
-    on_ready: Callable[[str], None],
-    stop: threading.Event | None,
-    world: WorldGeometry | None,
-    metrics: str | None,
-) -> None:
-    from skyloop.cockpit.access import TokenGate
-    from skyloop.cockpit.app import create_app
-    from skyloop.cockpit.fleet import Fleet
-    from skyloop.cockpit.recordings import Recordings
-    from skyloop.cockpit.security import bind_address, own_names
-    from skyloop.cockpit.target_tracker import warm_up
-
-    address, port = listening.getsockname()[:2]
-    own_name = () if bind_address(address)[1] else host_names()
-    hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
-    admission = Admission(places_here())
-    fleet = Fleet(finder, kept=names)
-    authority = None if access.page_authority is None else access.page_authority.read_bytes()
-    app = create_app(
-        fleet, Recordings(recordings), hosts, gate, admission=admission, world=world, page_authority=authority
-    )
-    server = quiet_server(app)
-    seen_at = reachable(address)[0]
-    page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
-    listener = Listener(listening, admission, http_protocol(server, admission), tls)
-    with ExitStack() as beside:
-        if metrics is not None:
-            from skyloop.metrics import serve
-
-            endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
-            print(endpoint.announcement, file=sys.stderr, flush=True)
-        pairing = gate.pairing if isinstance(gate, TokenGate) else None
-        expire_codes = _idle if pairing is None else pairing.expire
-        threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, expire_codes))
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
