@@ -15,20 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
 
-from skyloop.cli import interrupt_by_signals
-from skyloop.cli.naming import (
-    DroneOption,
-    KeysOption,
-    NetworkOption,
-    OptionalNameArgument,
-    PriorityOption,
-    SecondsOption,
-    WaitOption,
-    drone_names,
-    join_network,
-    one_drone,
-    python_files,
-)
+from skyloop.cli import interrupt_by_signals, naming
 from skyloop.cli.text import coloured, tell
 from skyloop.clock import beats
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UnknownNameError, UsageError
@@ -61,24 +48,24 @@ def fly(
         typer.Argument(
             metavar="FILE",
             help="Python file with a class derived from skyloop.Controller",
-            autocompletion=python_files,
+            autocompletion=naming.python_files,
         ),
     ],
-    name: OptionalNameArgument = None,
-    drone: DroneOption = None,
+    name: naming.OptionalNameArgument = None,
+    drone: naming.DroneOption = None,
     on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # a former name
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
-    seconds: SecondsOption = None,
-    priority: PriorityOption = 16,
-    wait: WaitOption = 0.0,
+    seconds: naming.SecondsOption = None,
+    priority: naming.PriorityOption = 16,
+    wait: naming.WaitOption = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
         bool, typer.Option("--reload", help="Reload the file when saved; after an error, hover until then")
     ] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
@@ -92,8 +79,8 @@ def fly(
     from skyloop.client import Authority
     from skyloop.control.loading import Reloader, load_controller
 
-    join_network(network, keys)
-    target = one_drone(name, drone or on, default="sim://")
+    naming.join_network(network, keys)
+    target = naming.one_drone(name, drone or on, default="sim://")
     if reload:  # otherwise a module saved twice within a second would be loaded from Python's cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
@@ -385,11 +372,11 @@ def fly_follow(
         typer.Argument(
             metavar="[NAME]",
             help="A running proxy, or a vehicle's address; without: a simulated park",
-            autocompletion=drone_names,
+            autocompletion=naming.drone_names,
             show_default=False,
         ),
     ] = None,
-    drone: DroneOption = None,
+    drone: naming.DroneOption = None,
     box: Annotated[
         str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
     ] = None,
@@ -414,12 +401,12 @@ def fly_follow(
         float | None, typer.Option(metavar="M", help="Maximum distance from its start [default: no limit]")
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
-    seconds: SecondsOption = None,
-    priority: PriorityOption = 16,
-    wait: WaitOption = 0.0,
+    seconds: naming.SecondsOption = None,
+    priority: naming.PriorityOption = 16,
+    wait: naming.WaitOption = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, if it is on the ground")] = True,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Take off, follow a target by the camera, land. Without NAME a simulated drone follows a person in a park.
 
@@ -433,8 +420,8 @@ def fly_follow(
 
     if Path("follow").is_file():
         say("follow is the command here, not the file of that name: skyloop fly flies files that end in .py")
-    join_network(network, keys)
-    target = one_drone(name, drone, default=SIMULATED)
+    naming.join_network(network, keys)
+    target = naming.one_drone(name, drone, default=SIMULATED)
     if box is None and class_name is None:
         raise UsageError("no target given: give --class CLASS, such as person, or --box X,Y,W,H")
     modes = [each.value for each in FollowMode]

@@ -18,15 +18,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from skyloop.cli.naming import (
-    DroneOption,
-    KeysOption,
-    NameArgument,
-    NetworkOption,
-    SecondsOption,
-    join_network,
-    one_drone,
-)
+from skyloop.cli import naming
 from skyloop.cli.text import json_text, named
 from skyloop.messages import Event, Failsafe, Feedback, ReturnPhase, Severity
 
@@ -42,15 +34,15 @@ COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ER
 
 
 def watch(
-    name: NameArgument = None,
-    drone: DroneOption = None,
-    seconds: SecondsOption = None,
+    name: naming.NameArgument = None,
+    drone: naming.DroneOption = None,
+    seconds: naming.SecondsOption = None,
     video: Annotated[bool, typer.Option(help="Request the first camera's frames, to show their rate and age")] = True,
     json: Annotated[
         bool, typer.Option("--json", help="Print JSON lines, one each second and one for each event")
     ] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
 
@@ -58,8 +50,8 @@ def watch(
     """
     from skyloop.client import connect
 
-    join_network(network, keys)
-    with connect(one_drone(name, drone), access="observe", name="skyloop watch") as watched:
+    naming.join_network(network, keys)
+    with connect(naming.one_drone(name, drone), access="observe", name="skyloop watch") as watched:
         duration_s = math.inf if seconds is None else seconds
         if video and watched.capabilities.cameras:
             watched.frame()  # the first call subscribes

@@ -87,17 +87,15 @@ class Recording:
         if layout.META_RECORDING not in texts or layout.META_CLOCK not in texts:
             raise FileFormatError(_foreign(found))
         try:
-            start, clock = (
-                layout.from_metadata(texts[layout.META_RECORDING], Start),
-                layout.from_metadata(texts[layout.META_CLOCK], ClockPair),
-            )
+            start = layout.from_metadata(texts[layout.META_RECORDING], Start)
+            clock = layout.from_metadata(texts[layout.META_CLOCK], ClockPair)
             end = layout.from_metadata(texts[layout.META_END], End) if layout.META_END in texts else None
         except FileFormatError as error:
             raise FileFormatError(f"{found.path}: {error}") from None
         if not 1 <= start.layout <= layout.VERSION:
             raise FileFormatError(
-                f"{found.path} has layout {start.layout}, but this version of Skyloop reads layouts 1 to {layout.VERSION}: "
-                "use the version that recorded it, or a newer one"
+                f"{found.path} has layout {start.layout}, but this version of Skyloop reads layouts 1 to "
+                f"{layout.VERSION}: use the version that recorded it, or a newer one"
             )
         return cls(found.path, start, clock, end, found)
 
