@@ -20,19 +20,9 @@ from skyloop.clock import beats, nanoseconds
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import Severity
 from skyloop.messages.frame import H264, Chain
+from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.layout import (
-    META_CLOCK,
-    META_END,
-    META_RECORDING,
-    PROFILE,
-    VERSION,
-    ClockPair,
-    DroneRecord,
-    End,
-    Start,
-    to_metadata,
-)
+from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
 from skyloop.recording.translation import Message, Picture, Schema, Translator
 
@@ -134,9 +124,9 @@ class RecordingFile:
         self._schemas: dict[type, int] = {}
         self._channels: dict[str, int] = {}
         try:
-            self._writer.start(PROFILE, f"skyloop {start.skyloop}")
-            self._writer.add_metadata(META_CLOCK, to_metadata(clock))
-            self._writer.add_metadata(META_RECORDING, to_metadata(start))
+            self._writer.start(layout.PROFILE, f"skyloop {start.skyloop}")
+            self._writer.add_metadata(layout.META_CLOCK, layout.to_metadata(clock))
+            self._writer.add_metadata(layout.META_RECORDING, layout.to_metadata(start))
             self._output.flush()
         except OSError:
             self.abandon()
@@ -171,7 +161,7 @@ class RecordingFile:
         """Write the summary and close the file."""
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
-            self._writer.add_metadata(META_END, to_metadata(end))
+            self._writer.add_metadata(layout.META_END, layout.to_metadata(end))
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._output.flush()
         finally:
@@ -238,7 +228,9 @@ class FileWriter:
         self._opener = opener
         self._free = free
         self._floor = round(options.min_free_mb * MB)
-        self._start = Start(VERSION, __version__, tuple(drones), clock.unix_ns, options=msgspec.to_builtins(options))
+        self._start = Start(
+            layout.VERSION, __version__, tuple(drones), clock.unix_ns, options=msgspec.to_builtins(options)
+        )
         self._file: RecordingFile | None = None
         self._uncommitted: list[Item] = []
         self._closed_bytes = self._closed_messages = 0
