@@ -274,11 +274,6 @@ class ViewTopic:
     channels: tuple[str, ...]  #: the drone's channels that the topic needs; empty for state known in advance
     at_once: bool = True  #: whether the topic is announced before its first message
 
-    @property
-    def shared(self) -> bool:
-        """Whether all drones share the topic."""
-        return self.name in (layout.TF, layout.LOG)
-
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
     """Yield a drone's topics; the frames of a ``far`` drone are encoded for the network."""
