@@ -189,7 +189,7 @@ def _prepare(fleet: Fleet) -> None:
     from skyloop.host.vehicle import network_of
     from skyloop.vehicles.sim.options import options_of
 
-    opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
+    opened = [vehicle.name for vehicle in fleet.vehicles if (joined := network_of(vehicle)) and joined.tls is None]
     for vehicle in fleet.vehicles:
         if opened[:1] == [vehicle.name]:
             net.warn_if_open(network_of(vehicle), opened)
