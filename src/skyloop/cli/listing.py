@@ -292,7 +292,5 @@ def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -
     except AuthorityError as error:
         if error.code != "busy":
             raise
-        from skyloop.cli.listing import describe
-
         holder = describe(target).owner or "another application"
         raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

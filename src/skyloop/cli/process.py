@@ -216,15 +216,11 @@ def detect(
         if detector.names and each not in detector.names.values():
             raise UnknownNameError(f"class in {path.name if file is None else file}", each, detector.names.values())
     processor = DetectionProcessor(detector, wanted)
-
-    def make() -> Any:
-        return processor
-
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
     with contextlib.suppress(KeyboardInterrupt):  # the normal way to end
-        work(make, settings, drone, seconds, show_json if json else show_text, child=False)
+        work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
 class DetectionProcessor:

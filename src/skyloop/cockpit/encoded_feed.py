@@ -348,7 +348,7 @@ class EncodedFeed:
             )
             self._loop = asyncio.get_running_loop()
             self._came_ns = self._clock()
-            channel.add(self._put, _none_dropped)
+            channel.add(self._put, lambda: 0)
             self._channel = channel
         with self._lock:
             self._wakes[page] = wake
@@ -415,7 +415,3 @@ class EncodedFeed:
         if self._loop is not None:
             for wake in wakes:
                 call_soon(self._loop, wake)
-
-
-def _none_dropped() -> int:
-    return 0

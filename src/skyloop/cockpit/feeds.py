@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
@@ -150,21 +152,16 @@ class Newest(Generic[K, V]):
         self._values = {}
 
 
+@dataclass
 class Drawing:
     """A drawing for pages, encoded once for all of them."""
 
-    __slots__ = ("_text", "annotation")
+    annotation: Annotation
 
-    def __init__(self, annotation: Annotation) -> None:
-        self.annotation = annotation
-        self._text: str | None = None
-
-    @property
+    @cached_property
     def text(self) -> str:
         """The JSON message sent to pages."""
-        if self._text is None:
-            self._text = _encode(drawing_values(self.annotation)).decode()
-        return self._text
+        return _encode(drawing_values(self.annotation)).decode()
 
 
 def drawing_values(annotation: Annotation) -> dict[str, Any]:

@@ -140,10 +140,6 @@ class Fleet:
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
-    def want(self, name: str) -> None:
-        """Also show this drone, if the view is limited to certain names."""
-        self.finder.add_name(name)
-
     def let_go(self, name: str) -> None:
         """Remove a drone; if it is found again, it reappears. Do nothing if the name is unknown."""
         if name in self.stations:

@@ -183,7 +183,7 @@ class RecordingsApi:
     async def replay(self, request: Request) -> Response:
         wanted = await body_of(request, _Replay)
         name = await self._recordings.replay(request.path_params["name"], wanted.drone)
-        self._fleet.want(name)
+        self._fleet.finder.add_name(name)
         await self._fleet.search()
         return answer_json({"drone": name}, 201)
 

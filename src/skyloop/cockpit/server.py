@@ -172,7 +172,7 @@ def serve_cockpit(
 
             endpoint = closing.enter_context(serve(lambda: fleet_sources(fleet), metrics))
             print(endpoint.announcement, file=sys.stderr, flush=True)
-        expire_codes = _idle if pairing is None else pairing.expire
+        expire_codes = pairing.expire if pairing is not None else lambda: None
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
         asyncio.run(_run(server, listener, lambda: ready(page), stop, expire_codes))
 
@@ -345,10 +345,6 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
         timeout_graceful_shutdown=2,
     )
     return QuietServer(config)
-
-
-def _idle() -> None:
-    pass
 
 
 async def _run(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, Final, TypeGuard
+from typing import IO, Any, Final
 
 import msgspec
 
@@ -202,9 +202,11 @@ class Recording:
                 if not piece.end_ns or piece.end_ns >= from_ns:
                     held += (entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns)
                     held.sort(key=attrgetter("log_ns"))
-                    until = bisect_left(held, after.start_ns, key=attrgetter("log_ns")) if _has_start(after) else None
+                    until = len(held)
+                    if after is not None and after.start_ns > 0:  # otherwise the time of its first message is unknown
+                        until = bisect_left(held, after.start_ns, key=attrgetter("log_ns"))
                     yield from held[:until]
-                    held = [] if until is None else held[until:]
+                    held = held[until:]
                 if progress is not None:
                     progress(read / total)
 
@@ -315,11 +317,6 @@ class Recording:
 
 
 _Kind = tuple[str, bool]  # camera, and whether the image is the vehicle's own H.264
-
-
-def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
-    """Return whether the time of a piece's first message is known."""
-    return piece is not None and piece.start_ns > 0
 
 
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
