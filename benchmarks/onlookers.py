@@ -89,7 +89,7 @@ def show(pipe: Pipe, proxy: str, number: int) -> None:
 def serve(pipe: Pipe, proxy: str) -> None:
     """Run a live view for Foxglove; send its address."""
     from skyloop.recording.foxglove_server import FoxgloveServer
-    from skyloop.recording.view import View, give_way
+    from skyloop.recording.taps import View, give_way
 
     give_way()
     with connect(proxy, access="observe", name="view") as drone:

@@ -32,13 +32,13 @@ from skyloop.messages import (
 from skyloop.messages.frame import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, Channel, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
-from skyloop.recording.output import RecordingFile
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
 from skyloop.recording.review.tables import export_csv, read
 from skyloop.recording.review.video import export_mp4
 from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.writer import RecordingFile
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.video import H264_360P
 from skyloop.vehicles.emulation.video import Encoded, Encoder

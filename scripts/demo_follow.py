@@ -18,7 +18,7 @@ from rich.text import Text
 
 from skyloop.cli.app import run
 from skyloop.cli.demo import PagePort, drone_and_page, land
-from skyloop.cli.fly_follow import status_line
+from skyloop.cli.fly import status_line
 from skyloop.errors import MissingExtraError, UsageError, install_command
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typer.main import get_command
 
 import skyloop
 from skyloop.cli.app import build
-from skyloop.cli.fly_follow import SIDES
+from skyloop.cli.fly import SIDES
 from skyloop.clock import nanoseconds
 from skyloop.messages import Feedback
 from tests.support.commands import Run

@@ -79,7 +79,7 @@ def test_a_recording_that_is_not_complete_fails(
     run: Run, alpha: Process, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failed = Status(RecorderState.FAILED, "No space left", "f.mcap", ("f.mcap",))
-    monkeypatch.setattr("skyloop.recording.engine.Engine.status", property(lambda engine: failed))
+    monkeypatch.setattr("skyloop.recording.recorder.Engine.status", property(lambda engine: failed))
     ended = run("record", "alpha", "-o", str(tmp_path), "--seconds", "0.1", "--min-free-mb", "0")
     assert ended.code == 1
     assert "incomplete: No space left" in ended.err

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.recording.foxglove_access import ParameterAccess
+from skyloop.recording.foxglove_server import ParameterAccess
 from tests.support import fake_rerun
 from tests.support.commands import Run
 from tests.support.processes import Process
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.process
 @pytest.fixture(autouse=True)
 def priority(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the priority of the tests' own process."""
-    monkeypatch.setattr("skyloop.recording.view.give_way", lambda: None)
+    monkeypatch.setattr("skyloop.recording.taps.give_way", lambda: None)
 
 
 def test_foxglove_until_it_is_interrupted(start: Callable[..., Process], alpha: Process) -> None:

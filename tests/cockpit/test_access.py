@@ -21,6 +21,7 @@ from skyloop.cockpit.access import (
     OpenGate,
     Pairing,
     Person,
+    SessionFile,
     Token,
     TokenGate,
     peer_uid,
@@ -28,7 +29,6 @@ from skyloop.cockpit.access import (
     read_tokens,
     uid_in,
 )
-from skyloop.cockpit.sessions import SessionFile
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from skyloop.cockpit.commands import FollowTarget
 from skyloop.cockpit.encoded_feed import FPS, KEPT, RATES, SCALES, EncodedFeed, Form, form_for
 from skyloop.cockpit.follow_session import in_frame
-from skyloop.cockpit.page_stream import (
+from skyloop.cockpit.station import Station
+from skyloop.cockpit.stream import (
     FALLS_BEHIND_S,
     LATE_S,
     MOST_BYTES,
@@ -26,7 +27,6 @@ from skyloop.cockpit.page_stream import (
     PagePath,
     PageStream,
 )
-from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.messages import CameraInfo, Encoding, FrameHeader
 from tests.support.cockpit import FakeDrone, FakeStream, cockpit, fake_fleet, open_socket, until

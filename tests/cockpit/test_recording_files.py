@@ -15,8 +15,7 @@ from skyloop.client import Drone
 from skyloop.cockpit import recording_files
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recording_files import Mark, Notes, check_name, notes_path
-from skyloop.cockpit.recordings import Recordings
-from skyloop.cockpit.reports import timeline
+from skyloop.cockpit.recordings import Recordings, timeline
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
 from skyloop.messages import Role

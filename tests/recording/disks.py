@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any, cast
 
-from skyloop.recording.output import Target
+from skyloop.recording.writer import Target
 
 
 class Disk:

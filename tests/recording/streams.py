@@ -14,8 +14,8 @@ from skyloop.messages import CameraInfo, Capabilities, Encoding, FrameHeader
 from skyloop.messages.frame import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
-from skyloop.recording.output import RecordingFile
 from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.writer import RecordingFile
 from skyloop.vehicles.emulation.video import Encoder, Format
 
 MS = 1_000_000

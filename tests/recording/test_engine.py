@@ -34,9 +34,9 @@ from skyloop.messages import (
 )
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording import layout
-from skyloop.recording.engine import Engine
 from skyloop.recording.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.recording.options import CHOICES, Options, RecorderState, channels_of
+from skyloop.recording.recorder import Engine
 from skyloop.recording.taps import Gaps, Video, encoder
 from skyloop.transport.memory import MemoryServer
 from tests.recording.disks import Disk

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from skyloop.cli import log_tables
+from skyloop.cli.log import info_parts
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.summary import summarise
 from tests.support.commands import Ended
@@ -70,7 +70,7 @@ def test_nothing_is_cut_in_a_pipe(tmp_path: Path) -> None:
 def test_a_narrow_terminal_folds_the_distinguishing_columns(flight: Path) -> None:
     recording = Recording.open(flight)
     screen = Console(width=60, file=io.StringIO())
-    for part in log_tables.info(recording, summarise(recording)):
+    for part in info_parts(recording, summarise(recording)):
         screen.print(part)
     assert isinstance(screen.file, io.StringIO)
     first = "".join(line[:20].strip() for line in screen.file.getvalue().splitlines())

@@ -34,12 +34,12 @@ from skyloop.recording.layout import (
     ResultRecord,
     Start,
 )
-from skyloop.recording.output import Message, RecordingFile
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import export_csv, export_npz, export_parquet, read
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import Message, Picture, Translator
+from skyloop.recording.writer import RecordingFile
 from skyloop.vehicles.replay.playback import Playback
 from skyloop.vehicles.replay.player import StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource

@@ -11,7 +11,8 @@ import pytest
 from skyloop.messages import Feedback
 from skyloop.recording import foxglove, layout
 from skyloop.recording.layout import META_CLOCK, META_END, META_RECORDING, ClockPair, DroneRecord, End, Start
-from skyloop.recording.output import Message, RecordingFile
+from skyloop.recording.translation import Message
+from skyloop.recording.writer import RecordingFile
 from tests.recording.disks import Disk
 from tests.support import recording_files as files
 

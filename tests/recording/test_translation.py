@@ -23,8 +23,7 @@ from skyloop.messages.relayed import pack
 from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord
-from skyloop.recording.output import Message
-from skyloop.recording.translation import Path, Picture, Translator
+from skyloop.recording.translation import Message, Path, Picture, Translator
 from tests.support.samples import CAMERA
 
 UNIX = 1_000_000_000_000_000_000

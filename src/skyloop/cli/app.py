@@ -8,7 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Final, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 import typer.main
@@ -70,8 +70,17 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 
 def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
-    """Return a command class that hands over to one of these commands if it is the first word."""
-    return type("Behaviours", (WithBehaviours,), {"behaviours": {n: _alone(n, each) for n, each in entries.items()}})
+    """Return a command class that hands over to one of these if it is the first word: ``skyloop fly follow``."""
+    others = {name: _alone(name, each) for name, each in entries.items()}
+
+    class WithBehaviours(Command):
+        def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+            other = others.get(args[0]) if args else None
+            if other is None:
+                return super().make_context(info_name, args, parent, **extra)
+            return other.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
+
+    return WithBehaviours
 
 
 def _alone(name: str, entry: Entry) -> Any:
@@ -176,23 +185,6 @@ class Command(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments and options."""
         write_options(self, ctx, formatter)
-
-
-class WithBehaviours(Command):
-    """A command whose first word may be another command with its own options: ``skyloop fly follow``.
-
-    Attributes:
-        behaviours: The other commands, by name.
-    """
-
-    behaviours: ClassVar[Mapping[str, Any]] = {}
-
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse the words for the command that they select."""
-        other = self.behaviours.get(args[0]) if args else None
-        if other is None:
-            return super().make_context(info_name, args, parent, **extra)
-        return other.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
 
 
 class Group(TyperGroup):

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 from rich.table import Table
 
-from skyloop.cli.text import console, named, progress_bar
+from skyloop.cli.text import console, named, print_json, progress_bar
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -55,18 +54,14 @@ def bench(
             simulator = measuring.measure_sim(seconds, progress)
             results, shown = simulator, [physics_table(simulator), drawing_table(simulator)]
     if json:
-        typer.echo(msgspec.json.encode(results).decode())
+        print_json(results)
     else:
         for table in shown:
             console().print(table)
 
 
 def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> list[tuple[int, int]]:
-    """Parse frame sizes such as ``320x240,640x480``.
-
-    Raises:
-        UsageError: The text is not a list of sizes.
-    """
+    """Parse frame sizes such as ``320x240,640x480``. Raise ``UsageError`` if the text is not a list of sizes."""
     sizes = []
     for word in text.split(",") if text is not None else ["x".join(map(str, _SMALL))]:
         width, _, height = word.strip().replace("×", "x").partition("x")

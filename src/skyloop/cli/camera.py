@@ -212,11 +212,7 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
 
 
 def _are_files(source: list[str]) -> bool:
-    """Return whether the sources are files.
-
-    Raises:
-        UsageError: Some are files and some are not.
-    """
+    """Return whether the sources are files. Raise ``UsageError`` if some are files and some are not."""
     files = [Path(name).is_file() for name in source]
     if any(files) and not all(files):
         raise UsageError(f"no file {source[files.index(False)]!r}: give only files, or one vehicle")

@@ -7,15 +7,7 @@ from typing import Annotated
 
 import typer
 
-from skyloop.cli.naming import (
-    DronesOption,
-    KeysOption,
-    NetworkOption,
-    drone_names,
-    drones,
-    join_network,
-    keys_directory,
-)
+from skyloop.cli import naming
 from skyloop.cli.network import MetricsOption
 from skyloop.messages import Role
 
@@ -26,10 +18,10 @@ def cockpit(
         typer.Argument(
             metavar="NAME...",
             help="Running proxies; without names: all, as they come and go",
-            autocompletion=drone_names,
+            autocompletion=naming.drone_names,
         ),
     ] = None,
-    drone: DronesOption = None,
+    drone: naming.DronesOption = None,
     port: Annotated[
         int | None,
         typer.Option(
@@ -65,8 +57,8 @@ def cockpit(
         str | None,
         typer.Option(metavar="FILE", help="World file of the room, for maps of drones that don't report theirs"),
     ] = None,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
     metrics: MetricsOption = None,
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
@@ -78,10 +70,10 @@ def cockpit(
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
     if https:
-        access = with_certificate(access, keys_directory() / "pages")
-    join_network(network, keys)
+        access = with_certificate(access, naming.keys_directory() / "pages")
+    naming.join_network(network, keys)
     serve_cockpit(
-        drones(names, drone, needed=False),
+        naming.drones(names, drone, needed=False),
         port=port,
         access=access,
         recordings=recordings,

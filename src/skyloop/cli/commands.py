@@ -67,7 +67,7 @@ COMMANDS: Final = {
         behaviours={
             "follow": Entry(
                 Task.FLY,
-                "fly_follow:fly_follow",
+                "fly:fly_follow",
                 "Follow the target in a box, or of a class",
                 "fly follow --class person --seconds 60",
                 ("vision", "detect"),

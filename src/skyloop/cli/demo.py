@@ -9,17 +9,17 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 from urllib.parse import urlencode
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from skyloop.cli.text import print_json
 from skyloop.clock import nanoseconds
 from skyloop.errors import LinkError
 from skyloop.messages import Feedback, Value
@@ -64,7 +64,7 @@ def demo(
     console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
     if json:
-        typer.echo(msgspec.json.encode(report).decode())
+        print_json(report)
     else:
         console.print(report.table())
     if headless and not report.good(ENOUGH_IN_VIEW):
@@ -168,20 +168,8 @@ def drone_and_page(
 ) -> Iterator[tuple[Drone, CockpitProcess | None, float]]:
     """Connect to a vehicle, wait for its first image, and show the page.
 
-    Args:
-        uri: The vehicle's address.
-        console: The console for output.
-        name: The pilot's name as shown to others.
-        stop: Called on the first Ctrl-C.
-        port: The page's port; None: the default one.
-        page_shown: Whether to show a page.
-        browser: Whether to open the page in the browser.
-
-    Yields:
-        The drone, the page if there is one, and the time of the first image (monotonic) [s].
-
-    Raises:
-        SkyloopError: Connecting failed.
+    ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port;
+    None: the default one. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess
@@ -283,9 +271,7 @@ class TruthMeter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._listener.cancel()
 
     def _compare(self, feedback: Feedback) -> None:

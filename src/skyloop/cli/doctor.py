@@ -20,13 +20,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.text import Text
 
 from skyloop.cli.install import EXTRAS
 from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
+from skyloop.cli.text import print_json
 from skyloop.client.preflight import Level, PreflightFinding
 from skyloop.errors import NoAnswerError, install_command
 from skyloop.messages import EventKind, LinkState, Severity
@@ -101,7 +101,7 @@ def doctor(
             console.print(as_text(finding))
         findings.append(finding)
     if json:
-        typer.echo(msgspec.json.encode(findings).decode())
+        print_json(findings)
     if any(finding.health is Health.BAD for finding in findings):
         raise typer.Exit(1)
 
@@ -299,11 +299,7 @@ def _proxies() -> Iterator[Finding]:
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """Return the findings about a vehicle in reading order.
-
-    Raises:
-        SkyloopError: The address is invalid.
-    """
+    """Return the findings about a vehicle in reading order. Raise ``SkyloopError`` if the address is invalid."""
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.drivers.registry import make_driver
 
@@ -373,7 +369,7 @@ def preflight(
             checked.next_feedback(STATE_S)
         findings = checked.preflight(video_s=VIDEO_S, folder=folder)
     if json:
-        typer.echo(msgspec.json.encode([asdict(finding) for finding in findings]).decode())
+        print_json([asdict(finding) for finding in findings])
     else:
         console = Console(soft_wrap=True)
         for finding in findings:

@@ -15,7 +15,7 @@ import msgspec
 import typer
 
 from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
-from skyloop.cli.text import error_text
+from skyloop.cli.text import error_text, print_json
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known, connect_to_stop, let_go
 
@@ -178,7 +178,7 @@ def _each(
             interrupted()
             raise
     if json:
-        typer.echo(msgspec.json.encode(ended).decode())
+        print_json(ended)
     if not all(one.ok for one in ended):
         raise typer.Exit(1)
 

@@ -1,4 +1,4 @@
-"""``skyloop fly``: flies a controller loaded from a file, and reports its progress and errors."""
+"""``skyloop fly``: flies a controller loaded from a file, or follows a target, and reports progress and errors."""
 
 from __future__ import annotations
 
@@ -11,24 +11,14 @@ import time
 import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
 
-from skyloop.cli import interrupt_by_signals
-from skyloop.cli.naming import (
-    DroneOption,
-    KeysOption,
-    NetworkOption,
-    OptionalNameArgument,
-    join_network,
-    one_drone,
-    python_files,
-)
+from skyloop.cli import interrupt_by_signals, naming
 from skyloop.cli.text import coloured, tell
 from skyloop.clock import beats
-from skyloop.errors import SkyloopError, UsageError
+from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UnknownNameError, UsageError
 from skyloop.extend import Known, end_flight, let_go
 from skyloop.messages import Failsafe, ReturnPhase
 
@@ -37,8 +27,11 @@ if TYPE_CHECKING:
 
     from skyloop.client import Drone
     from skyloop.client.channels import Listener
-    from skyloop.control import Controller
+    from skyloop.control import Controller, FollowTarget
     from skyloop.control.loading import Reloader
+    from skyloop.vision import OnnxDetector
+    from skyloop.vision.tracking import Box
+
 
 ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
@@ -55,28 +48,24 @@ def fly(
         typer.Argument(
             metavar="FILE",
             help="Python file with a class derived from skyloop.Controller",
-            autocompletion=python_files,
+            autocompletion=naming.python_files,
         ),
     ],
-    name: OptionalNameArgument = None,
-    drone: DroneOption = None,
+    name: naming.OptionalNameArgument = None,
+    drone: naming.DroneOption = None,
     on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # a former name
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    seconds: naming.SecondsOption = None,
+    priority: naming.PriorityOption = 16,
+    wait: naming.WaitOption = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
         bool, typer.Option("--reload", help="Reload the file when saved; after an error, hover until then")
     ] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
@@ -90,8 +79,8 @@ def fly(
     from skyloop.client import Authority
     from skyloop.control.loading import Reloader, load_controller
 
-    join_network(network, keys)
-    target = one_drone(name, drone or on, default="sim://")
+    naming.join_network(network, keys)
+    target = naming.one_drone(name, drone or on, default="sim://")
     if reload:  # otherwise a module saved twice within a second would be loaded from Python's cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
@@ -109,8 +98,7 @@ def fly(
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
     """Create the user's controller, and report methods that look like misspelt callbacks.
 
-    Raises:
-        UsageError: The class can't be created with a drone as its only argument.
+    Raise ``UsageError`` if the class can't be created with a drone as its only argument.
     """
     from skyloop.control.controller import misspelt
 
@@ -338,9 +326,7 @@ class FlightProgress:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         if self._live is not None:
             self._live.stop()
@@ -365,5 +351,171 @@ def flight_line(drone: Drone, flown_s: float) -> str:
         "" if feedback.battery is None else f"battery {feedback.battery:.0%}",
         f"{rate:.1f} frames/s" if video else "",
         f"{dropped} dropped" if video else "",
+    ]
+    return "  ".join(part for part in parts if part)
+
+
+# skyloop fly follow ----------------------------------------------------------------------------------------------
+
+
+SIMULATED: Final = "sim://?world=park&cameras=front&fps=15"
+#: Directions as seen from the target, counter-clockwise from its direction of motion.
+SIDES: Final = {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
+_RESULT_WITHIN_S: Final = 3.0
+_FIRST_FRAME_S: Final = 10.0
+_LINE_EVERY_S: Final = 1.0
+
+
+def fly_follow(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[NAME]",
+            help="A running proxy, or a vehicle's address; without: a simulated park",
+            autocompletion=naming.drone_names,
+            show_default=False,
+        ),
+    ] = None,
+    drone: naming.DroneOption = None,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
+    ] = None,
+    class_name: Annotated[
+        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person")
+    ] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(
+            "--detector",
+            metavar="FILE.onnx|NAME",
+            help="ONNX file, or running processor of detections [in simulation, for --class: Skyloop's own]",
+        ),
+    ] = None,
+    mode: Annotated[str, typer.Option(metavar="MODE", help="follow, orbit or look")] = "follow",
+    distance: Annotated[float, typer.Option(metavar="M", help="Distance to keep; above 2")] = 4.0,
+    side: Annotated[
+        str | None,
+        typer.Option(metavar="SIDE", help="Side of the target to stay on: ahead, behind, left or right [default: any]"),
+    ] = None,
+    leash: Annotated[
+        float | None, typer.Option(metavar="M", help="Maximum distance from its start [default: no limit]")
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
+    seconds: naming.SecondsOption = None,
+    priority: naming.PriorityOption = 16,
+    wait: naming.WaitOption = 0.0,
+    takeoff: Annotated[bool, typer.Option(help="Take off first, if it is on the ground")] = True,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
+) -> None:
+    """Take off, follow a target by the camera, land. Without NAME a simulated drone follows a person in a park.
+
+    Give --class, --box, or both. It does not see walls and trees: fly it where there are none.
+
+    A line each second on standard error shows the progress. Ctrl-C lands. Exit code 1 if the target was lost for good.
+    """
+    from skyloop.cli.listing import connect_pilot
+    from skyloop.client import Authority
+    from skyloop.control import ChaseSettings, FollowMode, FollowTarget
+
+    if Path("follow").is_file():
+        say("follow is the command here, not the file of that name: skyloop fly flies files that end in .py")
+    naming.join_network(network, keys)
+    target = naming.one_drone(name, drone, default=SIMULATED)
+    if box is None and class_name is None:
+        raise UsageError("no target given: give --class CLASS, such as person, or --box X,Y,W,H")
+    modes = [each.value for each in FollowMode]
+    if mode not in modes:
+        raise UnknownNameError("mode", mode, modes)
+    if side is not None and side not in SIDES:
+        raise UnknownNameError("side", side, SIDES)
+    settings = ChaseSettings(distance_m=distance, bearing_rad=None if side is None else SIDES[side], leash_m=leash)
+    given = None if box is None else _box(box)
+    loaded = None if detector is None else _detector(detector, class_name)
+    interrupt_by_signals()
+    authority = Authority(priority=priority, wait_s=wait)
+    with connect_pilot(target, ADVICE, name="follow", authority=authority) as flown:
+        if loaded is None and given is None:
+            loaded = _packaged(flown, class_name)
+        pilot = FollowTarget(
+            flown, given, class_name=class_name, mode=mode, detector=loaded, camera=camera, settings=settings
+        )
+        _check(flown, camera, given, loaded)
+        progress = FlightProgress(flown, what=lambda: status_line(pilot), every_s=_LINE_EVERY_S)
+        worked = run(Flight(flown, pilot, say), flown, seconds, takeoff=takeoff, progress=progress)
+        if pilot.done:
+            say("the target was lost for too long")
+        land(flown)
+    if not worked or pilot.done:
+        raise typer.Exit(1)
+
+
+def _box(text: str) -> Box:
+    try:
+        x, y, width, height = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"--box must be X,Y,W,H: left and upper edge, width and height in pixels, got {text!r}"
+        ) from None
+    if not all(map(math.isfinite, (x, y, width, height))):
+        raise UsageError(f"--box must consist of finite numbers, got {text!r}")
+    return x, y, width, height
+
+
+def _detector(given: str, class_name: str | None) -> OnnxDetector | str:
+    """Return the detector loaded from a file, or the name of a processor."""
+    from skyloop.vision import OnnxDetector
+
+    if not given.endswith(".onnx") and "/" not in given and not Path(given).is_file():
+        return given
+    found = OnnxDetector(given)
+    _check_class(found, class_name, given)
+    return found
+
+
+def _packaged(drone: Drone, class_name: str | None) -> OnnxDetector:
+    from skyloop.vision import simulated_detector
+
+    if drone.capabilities.vehicle != "sim":
+        raise UsageError(
+            f"following a {class_name!r} needs a detector, and Skyloop's own only knows the simulator's figures: give "
+            "--detector FILE.onnx, or the NAME of a running skyloop detect; or --box X,Y,W,H"
+        )
+    found = simulated_detector()
+    _check_class(found, class_name, "Skyloop's detector")
+    return found
+
+
+def _check_class(detector: OnnxDetector, class_name: str | None, where: str) -> None:
+    known = detector.names.values()
+    if class_name is not None and known and class_name not in known:
+        raise UnknownNameError(f"class in {where}", class_name, known)
+
+
+def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDetector | str | None) -> None:
+    """Refuse, while still on the ground, anything that would end the flight in the air."""
+    from skyloop.vision.tracking import checked_box
+
+    if box is not None:
+        checked_box(box, drone.next_frame(camera, timeout_s=_FIRST_FRAME_S).shape)
+    if isinstance(detector, str):
+        try:
+            next(iter(drone.results(detector, timeout_s=_RESULT_WITHIN_S)))
+        except NoAnswerError as error:
+            raise LinkError(
+                f"no results from a processor named {detector!r} within {_RESULT_WITHIN_S:g} s: start it with "
+                f"skyloop detect FILE.onnx --on {drone.name} --name {detector}, or give an ONNX file"
+            ) from error
+
+
+def status_line(pilot: FollowTarget) -> str:
+    """Return the state of following in one line: the target's phase, its position, and how certain it is."""
+    status = pilot.status
+    parts = [
+        status.phase,
+        "" if status.range_m is None else f"{status.range_m:.1f} m away",
+        "" if status.confidence is None else f"confidence {status.confidence:.0%}",
+        f"unseen for {status.lost_s:.1f} s" if status.lost_s else "",
+        status.problem,
     ]
     return "  ".join(part for part in parts if part)

@@ -5,23 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
-from skyloop.cli.network import (
-    ConnectOption,
-    KeysOption,
-    ListenOption,
-    MetricsOption,
-    MulticastOption,
-    ServeOption,
-    key_changes,
-    metrics_beside,
-    server_ends,
-    settings_of,
-    warn_if_open,
-)
-from skyloop.cli.text import columns
+from skyloop.cli import network as net
+from skyloop.cli.text import columns, print_json
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,16 +30,16 @@ def proxy(
     group: Annotated[
         str | None, typer.Option(metavar="GROUP", help="Group of users whose members may also connect")
     ] = None,
-    network: ServeOption = None,
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    multicast: MulticastOption = True,
-    keys: KeysOption = None,
+    network: net.ServeOption = None,
+    listen: net.ListenOption = None,
+    connect: net.ConnectOption = None,
+    multicast: net.MulticastOption = True,
+    keys: net.KeysOption = None,
     audit: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="File for the audit trail of flights [in the user's state directory]"),
     ] = None,
-    metrics: MetricsOption = None,
+    metrics: net.MetricsOption = None,
     parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Serve one vehicle to applications, until Ctrl-C, which lands it first.
@@ -63,26 +50,25 @@ def proxy(
     from skyloop.drivers.uri import parse_uri
     from skyloop.proxy.serve import serve
 
-    settings = settings_of(network, listen, connect, multicast, keys)
+    settings = net.settings_of(network, listen, connect, multicast, keys)
     vehicle = parse_uri((handed_over() if parent_fd is not None else None) or uri)
     if vehicle.scheme == "sim":
-        from skyloop.cli.network import settle
         from skyloop.vehicles.sim.options import options_of
 
-        settle(options_of(vehicle))
-    warn_if_open(settings, [name])
+        net.settle(options_of(vehicle))
+    net.warn_if_open(settings, [name])
     serve(
         vehicle,
         name,
-        make_end=server_ends(settings, group),
+        make_end=net.server_ends(settings, group),
         parent_fd=parent_fd,
-        look=key_changes(settings),
+        look=net.key_changes(settings),
         audit=audit,
-        beside=metrics_beside(metrics),
+        beside=net.metrics_beside(metrics),
     )
 
 
-def host(fleet: FleetArgument, group: GroupOption = None, metrics: MetricsOption = None) -> None:
+def host(fleet: FleetArgument, group: GroupOption = None, metrics: net.MetricsOption = None) -> None:
     """Serve all vehicles of a file from one process, until Ctrl-C, which lands them first.
 
     skyloop host status, add and remove show and change its vehicles while it runs; each has its own --help.
@@ -105,10 +91,9 @@ def status(
 
     rows = _ask(Status(), host, group).vehicles
     if json:
-        typer.echo(msgspec.json.encode(rows).decode())
+        print_json(rows)
         return
-    for line in lines(rows):
-        typer.echo(line)
+    typer.echo("\n".join(lines(rows)))
 
 
 def add(
@@ -137,8 +122,7 @@ def add(
         answer = _ask(Add(read_fleet(Path(what)).vehicles), host, group)
     else:
         answer = _ask(AddNamed(what, address, own_process), host, group)
-    for line in lines(answer.vehicles):
-        typer.echo(line)
+    typer.echo("\n".join(lines(answer.vehicles)))
     for name, why in answer.problems.items():
         typer.echo(f"skyloop: {name} was not added: {why}", err=True)
     if answer.problems:
@@ -202,14 +186,13 @@ def _ask(request: Request, host: str | None, group: str | None) -> Answer:
 
 def _prepare(fleet: Fleet) -> None:
     """Warn about an open network, and prepare this process for the threads of simulators."""
-    from skyloop.cli.network import settle, warn_if_open
     from skyloop.host.vehicle import network_of
     from skyloop.vehicles.sim.options import options_of
 
-    opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
+    opened = [vehicle.name for vehicle in fleet.vehicles if (joined := network_of(vehicle)) and joined.tls is None]
     for vehicle in fleet.vehicles:
         if opened[:1] == [vehicle.name]:
-            warn_if_open(network_of(vehicle), opened)
+            net.warn_if_open(network_of(vehicle), opened)
         uri = vehicle.address
         if uri.scheme == "sim" and not vehicle.own_process:
-            settle(options_of(uri))
+            net.settle(options_of(uri))

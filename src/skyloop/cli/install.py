@@ -67,9 +67,8 @@ def install(
 def requirements(parts: Iterable[str]) -> list[str]:
     """Return the requirements of optional parts in pip's syntax.
 
-    Raises:
-        UnknownNameError: There is no part with this name.
-        SkyloopError: Skyloop's own metadata is missing, because it runs from a folder without having been installed.
+    Raise ``UnknownNameError`` if there is no part with this name, or ``SkyloopError`` if Skyloop's own metadata is
+    missing, because it runs from a folder without having been installed.
     """
     table: dict[str, list[str]] = {}
     for line in _metadata():

@@ -12,7 +12,6 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from skyloop.errors import UnsupportedError, UsageError
@@ -276,9 +275,8 @@ class Tokenizer:
 class Keyboard:
     """Reads the terminal's keys one by one, without Enter; a context manager that restores the terminal.
 
-    Raises:
-        UsageError: Standard input is not a terminal.
-        UnsupportedError: This platform's terminals can't report single keys.
+    Raise ``UsageError`` if standard input is not a terminal, or ``UnsupportedError`` if this platform's terminals can't
+    report single keys.
     """
 
     def __init__(self) -> None:
@@ -305,9 +303,7 @@ class Keyboard:
         )  # a shell has set its own mode in the meantime
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         signal.signal(signal.SIGCONT, self._continued)
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
 
@@ -328,11 +324,7 @@ class Keyboard:
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
-        """Return the keys pressed, as soon as there are any.
-
-        Raises:
-            EOFError: The terminal is gone.
-        """
+        """Return the keys pressed, as soon as there are any. Raise ``EOFError`` if the terminal is gone."""
         if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)

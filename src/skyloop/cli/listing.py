@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, drone_names, join_network, one_drone
-from skyloop.cli.text import columns
+from skyloop.cli.text import columns, print_json
 from skyloop.errors import AuthorityError, SkyloopError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
@@ -62,12 +62,11 @@ def list_proxies(
     settings = choose()
     rows = running(settings)
     if json:
-        typer.echo(msgspec.json.encode(rows).decode())
+        print_json(rows)
     elif not rows:
         typer.echo(none_runs(settings))
     else:
-        for line in lines(rows):
-            typer.echo(line)
+        typer.echo("\n".join(lines(rows)))
         if others := of_others():
             typer.echo(others, err=True)
 
@@ -176,11 +175,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer with this name, over the transport in its row.
-
-    Raises:
-        SkyloopError: The proxy does not answer.
-    """
+    """Connect to a proxy as an observer with this name, over the transport in its row."""
     from skyloop.client import connect
 
     far = "local" not in row.transport
@@ -238,12 +233,11 @@ def audit(
     rows = tenures(entries)
     rows = rows[-last:] if last is not None else rows
     if json:
-        typer.echo(msgspec.json.encode(rows).decode())
+        print_json(rows)
     elif not rows:
         typer.echo("The audit trail has no flights yet.")
     else:
-        for line in flight_lines(rows):
-            typer.echo(line)
+        typer.echo("\n".join(flight_lines(rows)))
     if bad:
         typer.echo(f"Skipped {bad} {'line' if bad == 1 else 'lines'} that can't be parsed.", err=True)
 
@@ -298,7 +292,5 @@ def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -
     except AuthorityError as error:
         if error.code != "busy":
             raise
-        from skyloop.cli.listing import describe
-
         holder = describe(target).owner or "another application"
         raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

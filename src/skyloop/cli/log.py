@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
+import msgspec
 import typer
+from rich.table import Table
+from rich.text import Text
 
 from skyloop.cli.naming import recordings
-from skyloop.cli.text import console, progress_bar, tell
+from skyloop.cli.text import console, named, print_json, progress_bar, tell
+from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from skyloop.recording.layout import Channel
-    from skyloop.recording.reader import Recording
+    from skyloop.recording.reader import Described, Recording
+    from skyloop.recording.review.compare import Comparison
+    from skyloop.recording.review.summary import Delay, Row, Summary
+    from skyloop.recording.review.video import Videos
 
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -58,17 +69,18 @@ def info(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
     """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems of the file."""
-    from skyloop.cli import log_tables
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)
     with progress_bar("reading") as progress:
         summary = summarise(recording, progress)
     if json:
-        typer.echo(log_tables.as_json(recording, summary))
+        started_ns = recording.start.started_unix_ns
+        head = {"file": recording.path, "drones": recording.drones, "started_unix_ns": started_ns}
+        print_json(head | {"summary": summary})
         return
     screen = console()
-    for part in log_tables.info(recording, summary):
+    for part in info_parts(recording, summary):
         screen.print(part)
 
 
@@ -78,9 +90,6 @@ def list_recordings(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
     """List the recordings in a folder: drones, start and duration. Problems with a file are shown in its row."""
-    import msgspec
-
-    from skyloop.cli import log_tables
     from skyloop.recording.reader import ENDING, describe, shown_name
 
     try:
@@ -90,9 +99,9 @@ def list_recordings(
     rows = [(path, describe(path)) for path in paths]
     if json:
         found = [{"name": shown_name(path), **msgspec.structs.asdict(summary)} for path, summary in rows]
-        typer.echo(msgspec.json.encode(found).decode())
+        print_json(found)
     elif rows:
-        console().print(log_tables.listing(rows))
+        console().print(_listing(rows))
     else:
         typer.echo(f"No recordings in {folder}. Make one: skyloop record alpha")
 
@@ -148,7 +157,6 @@ def export(
     become episodes of a LeRobotDataset: pictures, the state when each was captured, and the commands. rrd is a file for
     Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording itself.
     """
-    from skyloop.cli import log_tables
     from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4
 
@@ -177,7 +185,7 @@ def export(
         target = _file(output, f"{file.stem}-{chosen}.mp4", file)
         with progress_bar(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
-        for line in log_tables.exported(found, chosen):
+        for line in _exported(found, chosen):
             tell(line)
         return
     _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
@@ -211,7 +219,6 @@ def compare(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
     """Compare a changed controller's commands to the old one's: RMS of each set-point, and where they diverge."""
-    from skyloop.cli import log_tables
     from skyloop.recording.review.compare import compare as commands_of
 
     if output is not None and output.suffix not in (".html", ".png"):
@@ -219,10 +226,11 @@ def compare(
     older, newer = _open(old), _open(new)
     found = commands_of(older, newer, drone=drone, what=what.value, part=part)
     if json:
-        typer.echo(log_tables.comparison_json(found))
+        names = ("aligned", "seconds", "same_action", "fields", "part_at_s", "counts")
+        print_json({name: getattr(found, name) for name in names})
     else:
         screen = console()
-        for part_ in log_tables.comparison(found, str(old), str(new)):
+        for part_ in _comparison(found, str(old), str(new)):
             screen.print(part_)
     if output is not None:
         from skyloop.recording.review.compare import write_comparison
@@ -240,7 +248,6 @@ def recover(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
     """Write the readable part of a cut or damaged recording to a new file with an index. The old file is kept."""
-    from skyloop.cli import log_tables
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
@@ -249,13 +256,13 @@ def recover(
     if not wrong and output is None:
         tell(f"{file} is complete: there is nothing to repair")
         if json:
-            typer.echo(log_tables.recovered_json(file, None))
+            print_json({"file": file, "saved": None})
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
     with progress_bar("mending") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
-        typer.echo(log_tables.recovered_json(file, saved))
+        print_json({"file": file, "saved": saved})
         return
     for problem in saved.why:
         tell(f"{file}: {problem}")
@@ -341,3 +348,121 @@ def _refuse(given: dict[str, bool], to: Form) -> None:
     for option, is_given in given.items():
         if is_given:
             raise UsageError(f"{option} has no effect on {to.value}: leave it out, or choose another --to")
+
+
+# As text for terminals ------------------------------------------------------------------------------------------
+
+
+def info_parts(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
+    """Yield the output of ``skyloop log info``."""
+    yield _head(recording, summary)
+    yield _channel_table(summary)
+    for words in _losses(summary):
+        yield Text(words, "yellow")
+    for note in summary.notes:
+        yield Text(note, "bold yellow")
+
+
+def _listing(rows: Sequence[tuple[Path, Described]]) -> Table:
+    """Return the recordings in a folder as a table."""
+    from skyloop.recording.reader import shown_name
+
+    table = Table(box=None)
+    for title in ("recording", "begun", "lasts", "drones", "problem"):
+        table.add_column(title, overflow="fold")
+    for path, summary in rows:
+        table.add_row(
+            Text(shown_name(path)),
+            "" if summary.started is None else time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.started)),
+            "" if summary.seconds is None else f"{summary.seconds:.1f} s",
+            Text(", ".join(summary.drones)),
+            Text(summary.problem),
+        )
+    return table
+
+
+def _head(recording: Recording, summary: Summary) -> Table:
+    table = Table.grid(padding=(0, 2))
+    start = recording.start
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(start.started_unix_ns / NS_PER_S))
+    size = recording.found.size / 1e6
+    table.add_row("file", Text(f"{recording.path}" + (f", number {start.file}" if start.file > 1 else ""), "bold"))
+    table.add_row("recorded", f"{began}, {summary.seconds:.1f} s, {size:.1f} MB, by Skyloop {start.skyloop}")
+    for drone in recording.drones:
+        what = drone.described
+        cameras = ", ".join(f"{one.name} {one.width}×{one.height}" for one in what.cameras) or "none"
+        table.add_row("drone", f"{drone.name}: {what.vehicle}, {drone.uri or 'no address'}; cameras: {cameras}")
+    events = ", ".join(f"{count} {severity}" for severity, count in sorted(summary.events.items()))
+    table.add_row("events", events or "none")
+    return table
+
+
+def _channel_table(summary: Summary) -> Table:
+    table = Table(box=None)
+    table.add_column("topic", overflow="fold")  # never cut, because it identifies the rows
+    for title in ("count", "rate", "gaps", "longest", "missing", "size"):
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("delay [ms]: median (p99)")
+    for row in summary.rows:
+        table.add_row(
+            row.topic,
+            str(row.count),
+            _rate(row),
+            str(row.gaps) if row.gaps else "",
+            f"{row.longest_s:.3g} s" if row.steady and row.longest_s is not None else "",
+            str(row.missing) if row.missing else "",
+            _size(row.bytes),
+            "\n".join(map(_delay, row.delays)),
+        )
+    return table
+
+
+def _rate(row: Row) -> str:
+    return f"{row.rate_hz:.3g} Hz" if row.steady and row.rate_hz is not None else ""
+
+
+def _size(number: int) -> str:
+    return f"{number / 1e6:.1f} MB" if number >= 1e5 else f"{number / 1e3:.1f} kB"
+
+
+def _delay(delay: Delay) -> str:
+    return f"{delay.median_s * 1e3:.2f} ({delay.p99_s * 1e3:.2f}) {delay.what}"
+
+
+def _losses(summary: Summary) -> Iterator[str]:
+    for what, counts in (("left out by the recorder", summary.dropped), ("never reached the recorder", summary.missed)):
+        for drone, channels in counts.items():
+            words = ", ".join(f"{count} of {channel}" for channel, count in channels.items() if count)
+            if words:
+                yield f"{drone}: {words} {what}"
+
+
+def _exported(found: Videos, camera: str) -> Iterator[str]:
+    """Yield a line for each exported video, and one about missing frames."""
+    for video in found.videos:
+        since = f", from {video.begin_s:.3f} s on" if video is not found.videos[0] else ""
+        how = "as it was recorded" if video.copied else "encoded"
+        yield f"{video.path}: {video.frames} frames of {camera}{since}, {video.width}×{video.height}, {how}"
+    if found.left_out:
+        why = "of another size" if not found.videos[0].copied else "without the frames they depend on"
+        yield f"{found.left_out} frames were skipped: damaged, or {why}"
+
+
+def _comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
+    """Return the differences between two recordings, as parts to print."""
+    parts = "they never diverge" if found.part_at_s is None else f"they diverge at {found.part_at_s:.2f} s"
+    table = Table(named("set-point"), "RMS", "largest", "at", "compared", box=None)
+    for field in found.fields:
+        table.add_row(
+            field.name,
+            f"{field.rms:.4f} {field.unit}",
+            f"{field.largest:.4f} {field.unit}",
+            f"{field.largest_at_s:.2f} s",
+            f"{field.seconds:.1f} s",
+        )
+    return [
+        f"{new} against {old}",
+        table if found.fields else "no set-point is in both at one time",
+        f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
+        f"the same kind of action {found.same_action:.1%} of the time; {parts}",
+    ]

@@ -105,6 +105,15 @@ KeysOption = Annotated[
     Path | None,
     typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]"),
 ]
+PriorityOption = Annotated[
+    int, typer.Option("--priority", metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")
+]
+WaitOption = Annotated[
+    float, typer.Option("--wait", metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+]
+SecondsOption = Annotated[
+    float | None, typer.Option("--seconds", metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
+]
 
 
 def keys_directory() -> Path:
@@ -117,13 +126,8 @@ def keys_directory() -> Path:
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
     """Return the drone that a command is for.
 
-    Args:
-        name: The drone given as NAME.
-        drone: The drone given as ``--drone``.
-        default: Used if neither is given; None: a name is required.
-
-    Raises:
-        UsageError: No drone is given, or two are.
+    ``default``: used if neither is given; None: a name is required. Raise ``UsageError`` if no drone is given, or two
+    are.
     """
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
@@ -136,8 +140,7 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
     """Return the drones that a command is for, each once: those given as NAME first, then those given as ``--drone``.
 
-    Raises:
-        UsageError: No drone is given, but one is required.
+    Raise ``UsageError`` if no drone is given, but one is required.
     """
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
@@ -153,8 +156,7 @@ def _running() -> str:
 def join_network(network: str | None, keys: Path | None) -> None:
     """Search the network given by the options, in this process and its children.
 
-    Raises:
-        UsageError: An address or the folder is invalid, or keys are given without a network.
+    Raise ``UsageError`` if an address or the folder is invalid, or keys are given without a network.
     """
     if network is None and keys is None:
         return

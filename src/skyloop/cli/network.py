@@ -14,11 +14,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-import msgspec
 import typer
 
 from skyloop.cli.naming import MULTICAST, keys_directory, network_places
-from skyloop.cli.text import columns, tell
+from skyloop.cli.text import columns, print_json, tell
 from skyloop.clock import SWITCH_INTERVAL_S
 from skyloop.errors import UsageError
 from skyloop.files import expand
@@ -78,8 +77,7 @@ def settings_of(
 ) -> FabricSettings | None:
     """Return the settings given by the options, or None to stay on this host.
 
-    Raises:
-        UsageError: An option needs ``--network``, or is invalid.
+    Raise ``UsageError`` if an option needs ``--network``, or is invalid.
     """
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
@@ -95,8 +93,7 @@ def places(
 ) -> FabricSettings:
     """Return the settings of a network given as in ``--network``.
 
-    Raises:
-        UsageError: An address or the folder is invalid, or no place is given.
+    Raise ``UsageError`` if an address or the folder is invalid, or no place is given.
     """
     from skyloop.network.config import serving
 
@@ -122,8 +119,7 @@ def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | No
 def metrics_beside(where: str | None) -> Beside | None:
     """Return the metrics server to run along with a process's proxies; None without ``--metrics``.
 
-    Raises:
-        UsageError: ``where`` is not an address.
+    Raise ``UsageError`` if ``where`` is not an address.
     """
     if where is None:
         return None
@@ -147,9 +143,6 @@ def settle(options: SimOptions) -> None:
 
     The GIL is released after one millisecond instead of five, and OpenCV uses one core. Do not call this in the user's
     process.
-
-    Raises:
-        MissingExtraError: Cameras were requested, but the renderer's extra is not installed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:
@@ -300,12 +293,11 @@ def show(
     now = datetime.now(UTC)
     if json:
         head = {"lab": roster.lab, "expires": int(authority.expires.timestamp()), "number": roster.number}
-        typer.echo(msgspec.json.encode(head | {"keys": roster.entries}).decode())
+        print_json(head | {"keys": roster.entries})
     else:
         typer.echo(f"{roster.lab}, valid until {_day(authority.expires)}; roster number {roster.number}")
         rows = [(e.name, e.role, ",".join(e.drones), _day(e.expires_at), _state(e, now)) for e in roster.entries]
-        for line in columns([("NAME", "ROLE", "DRONES", "VALID UNTIL", "STATE"), *rows]):
-            typer.echo(line)
+        typer.echo("\n".join(columns([("NAME", "ROLE", "DRONES", "VALID UNTIL", "STATE"), *rows])))
     ends = [("the lab's authority", authority.expires)]
     ends += [(f"the key of {entry.name}", entry.expires_at) for entry in roster.entries if not entry.revoked]
     for what, end in ends:

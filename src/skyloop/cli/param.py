@@ -7,16 +7,8 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from skyloop.cli.naming import (
-    DroneOption,
-    KeysOption,
-    NameArgument,
-    NetworkOption,
-    join_network,
-    one_drone,
-    parameter_names,
-)
-from skyloop.cli.text import columns
+from skyloop.cli import naming
+from skyloop.cli.text import columns, print_json
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
 
@@ -35,23 +27,23 @@ KINDS: Final = {
 
 
 def param(
-    name: NameArgument = None,
+    name: naming.NameArgument = None,
     key: Annotated[
         str | None,
         typer.Argument(
-            metavar="[KEY]", help="Parameter, or first part of several: limits", autocompletion=parameter_names
+            metavar="[KEY]", help="Parameter, or first part of several: limits", autocompletion=naming.parameter_names
         ),
     ] = None,
     value: Annotated[
         str | None, typer.Argument(metavar="[VALUE]", help="New value; takes the authority for a moment")
     ] = None,
-    drone: DroneOption = None,
+    drone: naming.DroneOption = None,
     priority: Annotated[
         int, typer.Option(metavar="P", min=0, max=31, help="Priority for writing: 0 is the highest, 31 the lowest")
     ] = 31,
     json: Annotated[bool, typer.Option("--json", help="Print the parameters as a JSON array")] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """List a vehicle's parameters, show one, or write one."""
     if drone is not None:  # in this case, the words that remain are KEY and VALUE
@@ -59,16 +51,15 @@ def param(
             raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
         if name != drone:
             name, key, value = drone, name, key
-    join_network(network, keys)
-    name = one_drone(name, drone)
+    naming.join_network(network, keys)
+    name = naming.one_drone(name, drone)
     if key is not None and value is None and "=" in key:
         key, value = key.split("=", 1)
     found = _write(name, key, value, priority) if key is not None and value is not None else _read(name, key)
     if json:
-        typer.echo(msgspec.json.encode([msgspec.structs.asdict(each) for each in found]).decode())
+        print_json([msgspec.structs.asdict(each) for each in found])
         return
-    for line in details(found[0]) if [each.name for each in found] == [key] else table(found):
-        typer.echo(line)
+    typer.echo("\n".join(details(found[0]) if [each.name for each in found] == [key] else table(found)))
 
 
 def _read(name: str, key: str | None) -> list[Parameter]:
@@ -94,8 +85,7 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 def parse_value(parameter: Parameter, text: str) -> Value:
     """Parse a value typed by a person according to the parameter's type.
 
-    Raises:
-        UsageError: The value has another type.
+    Raise ``UsageError`` if the value has another type.
     """
     try:
         match parameter.type:

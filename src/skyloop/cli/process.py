@@ -12,20 +12,10 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import msgspec
 import typer
 
-from skyloop.cli import interrupt_by_signals
-from skyloop.cli.naming import (
-    AnyNameArgument,
-    DroneOption,
-    KeysOption,
-    NetworkOption,
-    drone_names,
-    join_network,
-    one_drone,
-)
-from skyloop.cli.text import tell
+from skyloop.cli import interrupt_by_signals, naming
+from skyloop.cli.text import json_text, tell
 from skyloop.clock import beats
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.relayed import Polyline, Shape, Text
@@ -46,8 +36,8 @@ def process(
     target: Annotated[
         str, typer.Argument(metavar="CLASS", help="module:Class, FILE.py or FILE.py:Class, with process(self, frame)")
     ],
-    drone_name: AnyNameArgument = None,
-    drone: DroneOption = None,
+    drone_name: naming.AnyNameArgument = None,
+    drone: naming.DroneOption = None,
     camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the processor [default: the class's, in lower case]")
@@ -63,13 +53,11 @@ def process(
     stuck: Annotated[
         float, typer.Option(metavar="S", min=0.05, help="After this long on one frame, its share goes to others")
     ] = 2.0,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: naming.SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Process the newest frames of a drone with your own class, and publish its results. Read-only.
 
@@ -78,8 +66,8 @@ def process(
     """
     from skyloop.processing import Settings, load_processor
 
-    join_network(network, keys)
-    drone = one_drone(drone_name, drone)
+    naming.join_network(network, keys)
+    drone = naming.one_drone(drone_name, drone)
     code = load_processor(target)
     settings = Settings(name if name is not None else code.name, code.mark, camera, share, max_age, max_fps, stuck)
     interrupt_by_signals()
@@ -176,7 +164,7 @@ def show_text(status: Status) -> str:
 
 def show_json(status: Status) -> str:
     """Return a line for programs."""
-    return msgspec.json.encode(status).decode()
+    return json_text(status)
 
 
 def detect(
@@ -189,7 +177,7 @@ def detect(
         ),
     ] = None,
     on: Annotated[
-        str | None, typer.Option("--on", metavar="NAME", help="Running proxy", autocompletion=drone_names)
+        str | None, typer.Option("--on", metavar="NAME", help="Running proxy", autocompletion=naming.drone_names)
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
     score: Annotated[float, typer.Option(metavar="S", min=0.0, max=1.0, help="Minimum score of a detection")] = 0.4,
@@ -204,12 +192,10 @@ def detect(
     ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of the processor and its results")] = "detections",
     max_fps: Annotated[float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: naming.SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Detect people, cars or any class of your network in a drone's frames, and draw them live. Read-only.
 
@@ -221,8 +207,8 @@ def detect(
     from skyloop.vision import OnnxDetector
     from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
-    join_network(network, keys)
-    drone = one_drone(on, None)
+    naming.join_network(network, keys)
+    drone = naming.one_drone(on, None)
     path = SIMULATED_WEIGHTS if file is None else Path(file)
     detector = OnnxDetector(path, score=score, names=None if names is None else Path(names), layout=layout)
     wanted = [each.strip() for each in (classes or "").split(",") if each.strip()]
@@ -230,15 +216,11 @@ def detect(
         if detector.names and each not in detector.names.values():
             raise UnknownNameError(f"class in {path.name if file is None else file}", each, detector.names.values())
     processor = DetectionProcessor(detector, wanted)
-
-    def make() -> Any:
-        return processor
-
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
     with contextlib.suppress(KeyboardInterrupt):  # the normal way to end
-        work(make, settings, drone, seconds, show_json if json else show_text, child=False)
+        work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
 class DetectionProcessor:

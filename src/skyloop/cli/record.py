@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.recording import Recorder, Status
     from skyloop.recording.options import VideoEncoding
-    from skyloop.recording.view import Screen, View
+    from skyloop.recording.taps import Screen, View
 
 REFRESH_S: Final = 0.25  # used on a terminal
 LINE_EVERY_S: Final = 1.0  # used in a pipe
@@ -172,7 +172,7 @@ def view(
     interrupt_by_signals((signal.SIGTERM,))
     with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to end
         from skyloop.client import connect as connect_to
-        from skyloop.recording.view import View, give_way
+        from skyloop.recording.taps import View, give_way
 
         give_way()
         known = [stack.enter_context(connect_to(name, access="observe", name="skyloop view")) for name in chosen]

@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
-from skyloop.cli.text import tell
+from skyloop.cli.naming import PriorityOption, WaitOption
+from skyloop.cli.text import print_json, tell
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def check(
     with connect(drone, access="observe") as watched:
         found = check_for(watched, plan)
     if as_json:
-        typer.echo(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
         typer.echo(_summary(plan, found))
     if not found.ok:
@@ -54,10 +54,8 @@ def fly(
     file: FileArgument,
     drone: DroneOption = "sim://",
     photos: Annotated[Path, typer.Option(metavar="DIR", help="Folder for photos")] = Path("photos"),
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    priority: PriorityOption = 16,
+    wait: WaitOption = 0.0,
     land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
 ) -> None:
     """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""

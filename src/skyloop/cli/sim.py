@@ -16,20 +16,7 @@ from urllib.parse import urlencode
 
 import typer
 
-from skyloop.cli.network import (
-    ConnectOption,
-    KeysOption,
-    ListenOption,
-    MakeEnd,
-    MetricsOption,
-    MulticastOption,
-    ServeOption,
-    key_changes,
-    metrics_beside,
-    server_ends,
-    settings_of,
-    warn_if_open,
-)
+from skyloop.cli import network as net
 from skyloop.errors import UsageError
 from skyloop.vehicles.sim.firmware import AutopilotKind
 
@@ -76,12 +63,12 @@ def sim(
             "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; repeat it to assign several to the drones in turn",
         ),
     ] = None,
-    network: ServeOption = None,
-    listen: ListenOption = None,
-    connect: ConnectOption = None,
-    multicast: MulticastOption = True,
-    keys: KeysOption = None,
-    metrics: MetricsOption = None,
+    network: net.ServeOption = None,
+    listen: net.ListenOption = None,
+    connect: net.ConnectOption = None,
+    multicast: net.MulticastOption = True,
+    keys: net.KeysOption = None,
+    metrics: net.MetricsOption = None,
     firmware: Annotated[
         Firmware | None,
         typer.Option(
@@ -126,7 +113,6 @@ def sim(
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
     """
-    from skyloop.cli.network import settle
     from skyloop.drivers.uri import parse_uri
 
     chosen = [[f"autopilot={kind}"] for kind in autopilot] if autopilot else [[]]
@@ -146,12 +132,12 @@ def sim(
         given = [word for word, value in settings.items() if value is not None]
         if given:
             raise UsageError(f"{given[0]} is for --firmware: give --firmware {Firmware.ARDRONE2} as well")
-        network_settings = settings_of(network, listen, connect, multicast, keys)
-        settle(options)
+        network_settings = net.settings_of(network, listen, connect, multicast, keys)
+        net.settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
-        warn_if_open(network_settings, names)
-        look, beside = key_changes(network_settings), metrics_beside(metrics)
-        _serve_proxies(uris, options, names, server_ends(network_settings), look, beside)
+        net.warn_if_open(network_settings, names)
+        look, beside = net.key_changes(network_settings), net.metrics_beside(metrics)
+        _serve_proxies(uris, options, names, net.server_ends(network_settings), look, beside)
         return
     if metrics is not None:
         raise UsageError("--metrics is for proxies, and with --firmware there is none: leave it out")
@@ -162,7 +148,7 @@ def sim(
     _refuse_for_firmware(name, uri)
     from skyloop.vehicles.ardrone.emulator import Faults
 
-    settle(options)
+    net.settle(options)
     faults = Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0)
     serve(options, drones, firmware, Serving(bind or LOOPBACK, port_base, faults, delay or 0.0, video_port))
 
@@ -178,8 +164,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
     """Return the options of the world that the drones share.
 
-    Raises:
-        UsageError: An option is invalid, or the drones can't share a world.
+    Raise ``UsageError`` if an option is invalid, or the drones can't share a world.
     """
     from skyloop.vehicles.sim.options import options_of
 
@@ -197,7 +182,7 @@ def _serve_proxies(
     uris: list[VehicleUri],
     options: SimOptions,
     names: list[str],
-    make_end: MakeEnd,
+    make_end: net.MakeEnd,
     look: Callable[[], list[str]] | None,
     beside: Beside | None,
 ) -> None:
@@ -215,11 +200,7 @@ def _serve_proxies(
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """Return the vehicles' address.
-
-    Raises:
-        UsageError: An option does not exist, or its value is invalid.
-    """
+    """Return the vehicles' address. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
@@ -261,11 +242,8 @@ class Serving:
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
     """Run the drones until SIGINT or SIGTERM. Must run on the main thread.
 
-    Once all drones listen, print a line that begins with ``ready`` for each.
-
-    Raises:
-        UsageError: An option is invalid.
-        LinkError: A port is already in use.
+    Once all drones listen, print a line that begins with ``ready`` for each. Raise ``UsageError`` if an option is
+    invalid, or ``LinkError`` if a port is already in use.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
@@ -362,8 +340,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 def address_from(base: str, drone: int) -> str:
     """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
 
-    Raises:
-        UsageError: The first address is not IPv4, or there is no next address.
+    Raise ``UsageError`` if the first address is not IPv4, or there is no next address.
     """
     if drone == 0:
         return base
@@ -376,8 +353,7 @@ def address_from(base: str, drone: int) -> str:
 def ports_from(base: int, drone: int) -> Ports:
     """Return the ports of an AR.Drone: the first one's start at ``base`` (0: any free ones), each next one's 10 higher.
 
-    Raises:
-        UsageError: A port is out of range.
+    Raise ``UsageError`` if a port is out of range.
     """
     from skyloop.vehicles.ardrone.emulator import Ports
 

@@ -13,8 +13,8 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from skyloop.cli import naming
 from skyloop.cli.keyboard import KEY_MAP, TELL_FOCUS, TELL_NO_FOCUS, Deflection, Hands, Keyboard, Order
-from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import AuthorityError, SkyloopError
 from skyloop.extend import Known, commands, let_go
 from skyloop.messages import LinkState
@@ -31,17 +31,15 @@ GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the steps selected by + and -
 
 
 def teleop(
-    name: AnyNameArgument = None,
-    drone: DroneOption = None,
+    name: naming.AnyNameArgument = None,
+    drone: naming.DroneOption = None,
     speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Speed of a held key")] = 0.5,
     turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turn rate of a held key")] = 0.8,
-    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
-    ] = 0.0,
+    priority: naming.PriorityOption = 16,
+    wait: naming.WaitOption = 0.0,
     cockpit: Annotated[bool, typer.Option("--cockpit", help="Also serve a page that shows the video")] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Fly with keys and watch the drone's state live. It hovers when no key is held, and lands at the end.
 
@@ -50,8 +48,8 @@ def teleop(
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
 
-    join_network(network, keys)
-    target = one_drone(name, drone)
+    naming.join_network(network, keys)
+    target = naming.one_drone(name, drone)
     keyboard = Keyboard()
     authority = Authority(priority=priority, wait_s=wait)
     with connect_pilot(target, ADVICE, name="skyloop teleop", authority=authority) as flown:
@@ -78,11 +76,7 @@ class Teleop:
         self._taking = threading.Thread()
 
     def run(self, keyboard: Keyboard) -> None:
-        """Fly until Q is pressed.
-
-        Raises:
-            EOFError: The terminal is gone.
-        """
+        """Fly until Q is pressed. Raise ``EOFError`` if the terminal is gone."""
         # Draw on a separate thread: a stalled terminal must not delay keys.
         console = Console()
         with (

@@ -57,14 +57,23 @@ def tell(text: str) -> None:
     typer.echo(text, err=True)
 
 
+def print_json(value: Any) -> None:
+    """Print a value as one JSON document on standard output."""
+    typer.echo(json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """Return a value as JSON; what JSON has no form for, such as a path, becomes text."""
+    import msgspec
+
+    return msgspec.json.encode(value, enc_hook=str).decode()
+
+
 def coloured(line: str, stream: TextIO | None) -> str:
     """Return a line with its beginning coloured, if that has a meaning and the stream shows colours.
 
     A stream shows colours if it is a terminal, not a dumb one, and ``NO_COLOR`` is not set (https://no-color.org).
-
-    Args:
-        line: The line, for users.
-        stream: Where the line is printed. None, Python's value for a stream closed before the start: nowhere.
+    ``stream``: where the line is printed. None, Python's value for a stream closed before the start: nowhere.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line
@@ -104,8 +113,7 @@ def console() -> Console:
 def progress_bar(what: str) -> Iterator[Callable[..., None]]:
     """Show a progress bar on standard error, if that is a terminal, and remove it at the end.
 
-    Yields:
-        A function that updates the bar, given the fraction done (0 to 1) and optionally a new description.
+    Yield a function that updates the bar, given the fraction done (0 to 1) and optionally a new description.
     """
     if not sys.stderr.isatty():
         yield lambda *_: None

@@ -18,8 +18,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
-from skyloop.cli.text import named
+from skyloop.cli import naming
+from skyloop.cli.text import json_text, named
 from skyloop.messages import Event, Failsafe, Feedback, ReturnPhase, Severity
 
 if TYPE_CHECKING:
@@ -34,17 +34,15 @@ COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ER
 
 
 def watch(
-    name: NameArgument = None,
-    drone: DroneOption = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    name: naming.NameArgument = None,
+    drone: naming.DroneOption = None,
+    seconds: naming.SecondsOption = None,
     video: Annotated[bool, typer.Option(help="Request the first camera's frames, to show their rate and age")] = True,
     json: Annotated[
         bool, typer.Option("--json", help="Print JSON lines, one each second and one for each event")
     ] = False,
-    network: NetworkOption = None,
-    keys: KeysOption = None,
+    network: naming.NetworkOption = None,
+    keys: naming.KeysOption = None,
 ) -> None:
     """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
 
@@ -52,8 +50,8 @@ def watch(
     """
     from skyloop.client import connect
 
-    join_network(network, keys)
-    with connect(one_drone(name, drone), access="observe", name="skyloop watch") as watched:
+    naming.join_network(network, keys)
+    with connect(naming.one_drone(name, drone), access="observe", name="skyloop watch") as watched:
         duration_s = math.inf if seconds is None else seconds
         if video and watched.capabilities.cameras:
             watched.frame()  # the first call subscribes
@@ -96,7 +94,6 @@ def _live(drone: Drone, duration_s: float) -> None:
 
 
 def state_line(drone: Drone) -> str:
-    """Return the current state as a short line."""
     feedback, link = drone.feedback(), drone.link
     rates = [f"{name} {channel.rate_hz:.0f}/s" for name, channel in drone.stats.items() if channel.count > 1]
     parts = [
@@ -115,17 +112,16 @@ def state_line(drone: Drone) -> str:
 
 
 def event_line(event: Event) -> str:
-    """Return an event as a line."""
     return f"{time.strftime('%H:%M:%S')}  {event.severity.value}: {event.text}"
 
 
 def _state_json(drone: Drone) -> str:
     shown = {"feedback": msgspec.structs.asdict(drone.feedback()), "link": drone.link, "stats": drone.stats}
-    return msgspec.json.encode(shown).decode()
+    return json_text(shown)
 
 
 def _event_json(event: Event) -> str:
-    return msgspec.json.encode({"event": msgspec.structs.asdict(event)}).decode()
+    return json_text({"event": msgspec.structs.asdict(event)})
 
 
 # The live picture ----------------------------------------------------------------------------------------------
@@ -137,7 +133,6 @@ def picture(drone: Drone) -> Group:
 
 
 def state_panel(drone: Drone) -> Panel:
-    """Return a panel with the state of the drone and its links."""
     return Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left")
 
 

@@ -6,12 +6,11 @@ It only observes. A page that takes control has its own pilot connection while i
 - ``server`` runs the cockpit and ``listening`` accepts connections while it has places; ``app`` and ``api`` hold the
   routes; ``security`` decides which requests are answered, ``access`` who sent them and what that person may do;
 - ``discovery`` finds proxies; ``fleet`` keeps a ``station`` with the shared state of each drone, and lands and stops
-  all drones; ``feeds`` bring the client's data onto the event loop; ``encoded_feed`` holds JPEG and H.264 pictures,
-  from which ``page_stream`` selects those for a page; ``telemetry`` is the view model; ``stream`` sends, with one
-  object per open socket;
+  all drones; ``feeds`` bring the client's data onto the event loop; ``encoded_feed`` holds JPEG and H.264 pictures;
+  ``telemetry`` is the view model; ``stream`` selects and sends, with one object per open socket;
 - ``control_session`` flies for a page that has control, with ``commands``, over its own connection; ``takeover``
   handles requests for control;
-- ``recordings`` records and replays; ``reports`` makes reports in a child process;
+- ``recordings`` records, replays and makes reports in a child process;
 - ``testing`` is a page without a browser; ``child`` runs the cockpit beside a program;
 - ``static`` is the built page; nothing is fetched from elsewhere.
 """

@@ -20,11 +20,8 @@ from skyloop.network.config import choose
 def main(arguments: list[str] | None = None) -> int:
     """Run the cockpit.
 
-    Args:
-        arguments: Used in place of the command line's arguments.
-
-    Returns:
-        The exit code: 0, or 2 with a line of explanation if it could not start.
+    ``arguments``: used in place of the command line's arguments. Return the exit code: 0, or 2 with a line of
+    explanation if it could not start.
     """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
     parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they appear)")

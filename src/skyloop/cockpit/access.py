@@ -27,8 +27,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.sessions import Session, SessionFile
+import msgspec
+
+from skyloop.clock import Clock, boot_id, monotonic_ns, nanoseconds, seconds
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import decoded
 from skyloop.messages import Role
@@ -66,14 +67,7 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
     Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
     proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
     state, …, user id and inode. A socket already closed by its program is listed with user 0 and inode 0, so an entry
-    without an inode does not reveal who opened it.
-
-    Args:
-        client: The client's address and port.
-        server: This server's address and port.
-
-    Returns:
-        The user id, or None if it is unknown.
+    without an inode does not reveal who opened it. Return the user id, or None if it is unknown.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -96,9 +90,7 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 def _table_entry(end: Endpoint, mapped: bool) -> str:
     """Format an address as in the table: 32-bit words in the host's byte order.
 
-    Args:
-        end: Address and port.
-        mapped: Whether to write an IPv4 address as an IPv4-mapped IPv6 address.
+    ``mapped``: whether to write an IPv4 address as an IPv4-mapped IPv6 address.
     """
     address = ipaddress.ip_address(end[0])
     packed = address.packed
@@ -139,9 +131,7 @@ class Gate(Protocol):
 class OpenGate:
     """Gives one role to every program of the same user on this machine.
 
-    Args:
-        role: The role.
-        uid_of: Returns the client's user id, given both ends' addresses.
+    ``uid_of``: returns the client's user id, given both ends' addresses.
     """
 
     takes_tokens = False
@@ -170,9 +160,7 @@ class Token:
 class Pairing:
     """Issues codes that admit one browser each, only once and within :data:`PAIRING_S`. Used on the event loop.
 
-    Args:
-        role: The role given to browsers that use a code.
-        clock: The monotonic clock [ns].
+    ``role``: the role given to browsers that use a code.
     """
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
@@ -222,12 +210,8 @@ class TokenGate:
     ) -> None:
         """Restore the saved sessions whose token or pairing role is still valid.
 
-        Args:
-            tokens: The tokens to accept.
-            cookie: The name of the session cookie.
-            clock: The monotonic clock [ns].
-            pairing: Issues one-time codes, which can be used in place of a token.
-            kept: Where sessions are stored between runs of the cockpit.
+        ``pairing``: issues one-time codes, which can be used in place of a token. ``kept``: where sessions are stored
+        between runs of the cockpit.
         """
         self.cookie = cookie
         self.pairing = pairing
@@ -272,9 +256,7 @@ class TokenGate:
     def begin(self, person: Person, token: str = "") -> str:
         """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
 
-        Args:
-            person: The owner of the session.
-            token: The token that the session was given for.
+        ``token``: the token that the session was given for.
         """
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
@@ -317,12 +299,8 @@ class CertificateGate:
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
     """Return the role and name in a certificate.
 
-    Args:
-        certificate: The certificate in the form returned by ``SSLObject.getpeercert()``.
-
-    Returns:
-        The role from the organizational unit and the name from the common name. None if no OU is a role, or several
-        are.
+    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None if no OU is a
+    role, or several are.
     """
     if not certificate:
         return None
@@ -338,11 +316,9 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
 def read_tokens(path: Path) -> list[Token]:
     """Read the token file.
 
-    Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped.
-
-    Raises:
-        UsageError: The file can't be read, or is readable by others.
-        FileFormatError: A line is invalid, or there is no token.
+    Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped. Raise
+    ``UsageError`` if the file can't be read, or is readable by others, or ``FileFormatError`` if a line is invalid, or
+    there is no token.
     """
     try:
         mode = path.stat().st_mode
@@ -408,9 +384,6 @@ class WrongTokens:
     delayed, so an attacker can't lock out its owner, not even from the same address. Only rejections get slower: a
     guesser who waits for the answers gets few of them. A guesser who takes silence for a rejection is limited only by
     the rate of connections; the length of the tokens protects against that.
-
-    Args:
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, clock: Clock = monotonic_ns) -> None:
@@ -437,3 +410,61 @@ class WrongTokens:
         of_address_s = min(LONGEST_S, FIRST_S * 2.0 ** min(many - 1, 16))
         in_all_s = min(MOST_IN_ALL_S, EACH_IN_ALL_S * max(0, self._in_minute - FREE_IN_ALL))
         return min(LONGEST_S, of_address_s + in_all_s)
+
+
+# Sessions that outlive the cockpit's process ---------------------------------------------------------------------
+
+
+MAX_BYTES: Final = 1_000_000
+
+
+class Session(msgspec.Struct, frozen=True):
+    """One log-in."""
+
+    cookie: bytes  #: the cookie's hash
+    origin: bytes  #: hash of the token it was given for; empty if it was given for a pairing code
+    role: Role
+    name: str
+    until_ns: int  #: expiry on the monotonic clock
+
+
+class _Content(msgspec.Struct):
+    boot: str
+    sessions: list[Session]
+
+
+class SessionFile:
+    """Stores the sessions of one cockpit, so that after a restart a page reconnects without logging in again.
+
+    Only this user may read the file, next to the proxies' sockets. It contains hashes of cookies and tokens, which
+    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates it.
+    """
+
+    def __init__(self, path: Path, boot: str | None = None) -> None:
+        self._path = path
+        self._boot = boot_id() if boot is None else boot
+
+    def load(self) -> list[Session]:
+        """Return the sessions; none if the file is missing, damaged, another user's or from before a reboot."""
+        try:
+            descriptor = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            with os.fdopen(descriptor, "rb") as file:
+                found = os.fstat(file.fileno())
+                own = found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+                content = msgspec.json.decode(file.read(MAX_BYTES), type=_Content) if own else None
+        except (OSError, msgspec.DecodeError):
+            return []
+        return content.sessions if content is not None and self._boot and content.boot == self._boot else []
+
+    def save(self, sessions: Iterable[Session]) -> None:
+        """Replace the file. If that fails, people only have to log in again after a restart."""
+        new = self._path.with_name(f"{self._path.name}.new")
+        try:
+            with suppress(FileNotFoundError):
+                new.unlink()
+            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(msgspec.json.encode(_Content(self._boot, list(sessions))))
+            new.replace(self._path)
+        except OSError as error:
+            _log.warning("log-ins will not survive a restart of the cockpit: %s", error)

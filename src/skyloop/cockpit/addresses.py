@@ -90,10 +90,8 @@ def listener_of(port: int) -> str:
 def reachable(address: str) -> list[str]:
     """Return the addresses at which others can reach a service bound to ``address``, best first.
 
-    If the machine has no network, return its loopback address.
-
-    Args:
-        address: An address of this machine, ``0.0.0.0`` or ``::``.
+    If the machine has no network, return its loopback address. ``address`` is one of this machine's, ``0.0.0.0`` or
+    ``::``.
     """
     known = ipaddress.ip_address(address)
     if not known.is_unspecified:
@@ -150,11 +148,8 @@ class Announcer:
     """Prints the page's address, with a QR code for phones if others can reach the page and the terminal can show one.
 
     With pairing, the address in the QR code contains the pairing code after the ``#``, in the part that browsers never
-    send. The next code is printed as soon as the last one has been used or has expired.
-
-    Args:
-        pairing: Issues the codes; None if everyone is admitted or people have tokens.
-        loopback: Whether only this machine can reach the page.
+    send. The next code is printed as soon as the last one has been used or has expired. ``pairing``: issues the codes;
+    None if everyone is admitted or people have tokens. ``loopback``: whether only this machine can reach the page.
     """
 
     def __init__(self, pairing: Pairing | None, loopback: bool) -> None:
@@ -162,7 +157,6 @@ class Announcer:
         self._loopback = loopback
 
     def __call__(self, page: str) -> None:
-        """Print it."""
         print(f"cockpit: {page}", flush=True)
         if self._pairing is not None:
             self._pairing.on_used = lambda who: self._show(page, f"paired with {who}")

@@ -9,7 +9,7 @@ import asyncio
 import math
 from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -19,7 +19,7 @@ from skyloop.errors import SkyloopError, UnknownNameError
 from skyloop.messages import Event, EventKind, Failsafe, Feedback, FlightState, LinkState, ReturnPhase, Value
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone, LinkStatus
+    from skyloop.client import Config, Drone, LinkStatus
 
 _Make = Callable[[str, str], "Alarm"]
 _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
@@ -82,13 +82,8 @@ def alarms(
 ) -> list[Alarm]:
     """Return the current alarms, the most severe first.
 
-    Args:
-        link: The state of both hops.
-        feedback: The newest feedback, or None.
-        feedback_age_s: Age of that feedback [s].
-        video_age_s: Age of the frame shown [s], for each camera that is watched.
-        degraded_s: How long each degraded hop has been degraded [s], from :class:`DegradedTimes`.
-        thresholds: The limits for charges, ages and degraded links.
+    ``video_age_s``: age of the frame shown [s], for each camera that is watched. ``degraded_s``: how long each degraded
+    hop has been degraded [s], from :class:`DegradedTimes`.
     """
     # On the ground there is time: an alarm is urgent only if the vehicle is, or was last reported, in the air.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
@@ -163,20 +158,10 @@ PARAMETERS: Final = {
 }
 
 
-class _Readable(Protocol):
-    """The part of ``drone.config`` that is used here."""
-
-    def __getitem__(self, name: str, /) -> Value: ...
-
-
 class ThresholdReader:
     """Reads the thresholds, and reads them again after a parameter was written or a link was restored.
 
     Created and used on the event loop.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -217,16 +202,12 @@ class ThresholdReader:
             self._task = None
 
 
-def thresholds_of(config: _Readable) -> Thresholds:
-    """Read the thresholds; use the default for any that the proxy lacks or that is not finite.
-
-    Raises:
-        SkyloopError: The proxy does not answer.
-    """
+def thresholds_of(config: Config | Mapping[str, Value]) -> Thresholds:
+    """Read the thresholds; use the default for any that the proxy lacks or that is not finite."""
     return msgspec.structs.replace(USUAL, **{field: _number(config, name, field) for field, name in PARAMETERS.items()})
 
 
-def _number(config: _Readable, name: str, field: str) -> float:
+def _number(config: Config | Mapping[str, Value], name: str, field: str) -> float:
     usual: float = getattr(USUAL, field)
     try:
         value = config[name]

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.listening import Admission
     from skyloop.cockpit.routes import RouteFiles
-    from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
 LARGEST_BODY: Final = 65_536  #: maximum size of a request's body [bytes]
@@ -81,14 +80,7 @@ def answered(handler: Handler) -> Handler:
 
 
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Do work for a request, but cancel it if the client disconnects.
-
-    Returns:
-        The result of ``work``.
-
-    Raises:
-        ClientDisconnect: The client has disconnected.
-    """
+    """Do work for a request, but cancel it if the client disconnects."""
     task, gone = asyncio.create_task(work), asyncio.create_task(_gone(request))
     try:
         await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -107,7 +99,6 @@ async def _gone(request: Request) -> None:
 
 
 def answer_json(values: Any, status: int = 200) -> Response:
-    """Create an answer."""
     return Response(encode_json(values), status, media_type=_JSON)
 
 
@@ -120,12 +111,7 @@ def check_json(request: Request) -> None:
 async def body_of(request: Request, kind: type[T]) -> T:
     """Read and decode a request's body.
 
-    Args:
-        request: The request.
-        kind: The type to decode.
-
-    Raises:
-        BadRequest: The body is not JSON, is too large, does not arrive in time, or has the wrong type.
+    Raise ``BadRequest`` if the body is not JSON, is too large, does not arrive in time, or has the wrong type.
     """
     check_json(request)
     data = b""
@@ -150,13 +136,7 @@ class _Login(msgspec.Struct):
 class Api:
     """The routes below ``/api``.
 
-    Args:
-        fleet: The drones.
-        gate: Decides who is admitted.
-        counts: Counts of the messages sent to pages.
-        scheme: ``http`` or ``https``.
-        admission: The open connections.
-        authority: PEM certificate of the authority that signed the server's; None if the cockpit created none.
+    ``authority``: PEM certificate of the authority that signed the server's; None if the cockpit created none.
     """
 
     def __init__(
@@ -177,7 +157,6 @@ class Api:
         self._scheme = scheme
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/session", self.session),
             Route("/api/login", self.login, methods=["POST"]),
@@ -261,7 +240,7 @@ class Api:
     @answered
     async def parameters(self, request: Request) -> Response:
         """Answer with a drone's parameters."""
-        station = self._station(request.path_params["name"])
+        station = self._fleet.station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
         return answer_json([parameter_values(parameter) for parameter in found])
@@ -271,16 +250,12 @@ class Api:
 
         See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts only the current cameras.
         """
-        counts = self._counts
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return answer_json(
             {
-                "pages": counts.pages,
-                "frames_sent": counts.frames_sent,
-                "frames_acknowledged": counts.frames_acknowledged,
-                "frames_skipped": counts.frames_skipped,
+                **asdict(self._counts),
+                "sources": sorted(self._counts.sources),
                 "frames_encoded": sum(feed.encoded for feed in feeds),
-                "sources": sorted(counts.sources),
                 "left_out": {
                     "drawings": sum(station.event_feed.drawings.refused for station in self._fleet.stations.values()),
                     "series": sum(station.log_feed.refused for station in self._fleet.stations.values()),
@@ -293,12 +268,6 @@ class Api:
                 "wrong_tokens": self._gate.wrong.count if isinstance(self._gate, TokenGate) else 0,
             }
         )
-
-    def _station(self, name: str) -> Station:
-        stations = self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        return stations[name]
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
@@ -324,12 +293,7 @@ def _value(value: Value) -> Any:
 
 
 class RoutesApi:
-    """The routes below ``/api/routes``, and the check of a route for one drone.
-
-    Args:
-        fleet: The drones.
-        files: The stored routes.
-    """
+    """The routes below ``/api/routes``, and the check of a route for one drone."""
 
     def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
         self._fleet = fleet
@@ -337,7 +301,6 @@ class RoutesApi:
         self._checking = asyncio.Semaphore(MOST_CHECKS)
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/drones/{name}/route/check", self.check, methods=["POST"]),
             Route("/api/routes", self.listing),
@@ -349,10 +312,7 @@ class RoutesApi:
     @answered
     async def check(self, request: Request) -> Response:
         """Answer with a route's problems for a drone, and the ``id`` by which to fly it."""
-        name, stations = request.path_params["name"], self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        station = stations[name]
+        station = self._fleet.station(request.path_params["name"])
         route = parse_route(bytes(await body_of(request, msgspec.Raw)))
         async with self._checking:
             check = await asyncio.to_thread(check_for, station.drone, route, wait_s=0.0)
@@ -378,7 +338,6 @@ class RoutesApi:
 
     @answered
     async def delete(self, request: Request) -> Response:
-        """Delete a route."""
         check_json(request)
         name = request.path_params["name"]
         await asyncio.to_thread(self._files.delete, name)

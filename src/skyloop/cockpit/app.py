@@ -75,11 +75,7 @@ class _File:
 
 
 class PageFiles(StaticFiles):
-    """Serves the folder that contains the page.
-
-    Args:
-        folder: The folder; it need not exist.
-    """
+    """Serves the folder that contains the page. ``folder``: the folder; it need not exist."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder, check_dir=False)
@@ -149,14 +145,7 @@ _THREADS: Final = 32  # for blocking work: proxies that answer late, recorders t
 
 
 class Cockpit:
-    """Serves the page and the WebSockets.
-
-    Args:
-        fleet: The drones.
-        recordings: The recordings of the same drones.
-        static: The page's folder.
-        follower: Creates a follower for each target marked on a page.
-    """
+    """Serves the page and the WebSockets. ``follower``: creates a follower for each target marked on a page."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
         self.counts = PageCounts()

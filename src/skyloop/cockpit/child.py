@@ -8,7 +8,6 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from skyloop.child_process import ChildProcess
@@ -27,10 +26,8 @@ class CockpitProcess:
     def __init__(self, name: str | None = None, port: int | None = 0, recordings: Path | None = None) -> None:
         """Start the child without waiting for the page; see :meth:`address`.
 
-        Args:
-            name: The proxy to show; all by default.
-            port: The loopback port; 0 selects a free one, None the default or the next free one.
-            recordings: The folder for recordings.
+        ``name``: the proxy to show; all by default. ``port``: the loopback port; 0 selects a free one, None the default
+        or the next free one.
         """
         names = [] if name is None else [name]
         options = [] if recordings is None else ["--recordings", str(recordings)]
@@ -43,14 +40,8 @@ class CockpitProcess:
     def address(self, timeout_s: float = 15.0) -> str:
         """Wait until the page is served.
 
-        Args:
-            timeout_s: How long to wait [s].
-
-        Returns:
-            The page's address.
-
-        Raises:
-            LinkError: The page was not served in time, or the child ended; includes its last line of standard error.
+        Raise ``LinkError`` if the page was not served in time, or the child ended, with its last line of standard
+        error.
         """
         deadline = time.monotonic() + timeout_s
         line = b""
@@ -65,11 +56,7 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """Return the counts of messages sent to its pages, as in ``/api/statistics``.
-
-        Raises:
-            LinkError: The cockpit does not answer.
-        """
+        """Return the counts of messages sent to its pages, as in ``/api/statistics``."""
         try:
             with urllib.request.urlopen(f"{self.address()}api/statistics", timeout=_ASK_S) as answer:
                 values: dict[str, Any] = json.load(answer)
@@ -91,7 +78,5 @@ class CockpitProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

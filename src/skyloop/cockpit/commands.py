@@ -206,21 +206,13 @@ _fleet_decoder = msgspec.json.Decoder(AnyFleetCommand)
 
 
 def decode_command(text: str | bytes) -> AnyCommand:
-    """Decode a command for one drone.
-
-    Raises:
-        DecodeError: The command is invalid; the message says why.
-    """
+    """Decode a command for one drone. Raise ``DecodeError`` if the command is invalid; the message says why."""
     command: AnyCommand = _decoded(_decoder, text)
     return command
 
 
 def decode_fleet_command(text: str | bytes) -> AnyFleetCommand:
-    """Decode a command for all drones.
-
-    Raises:
-        DecodeError: The command is invalid; the message says why.
-    """
+    """Decode a command for all drones. Raise ``DecodeError`` if the command is invalid; the message says why."""
     command: AnyFleetCommand = _decoded(_fleet_decoder, text)
     return command
 
@@ -257,10 +249,6 @@ def untimely(command: Command, now_s: float) -> str:
     """Return the reason to refuse a command because of its age; empty if it is in time.
 
     A command whose age is unknown is refused, and one that might be too old is treated as too old.
-
-    Args:
-        command: The command.
-        now_s: The cockpit's clock [s].
     """
     if command.at_s is None:
         return "it has no time (at_s): send a ping first, its pong has the cockpit's clock"

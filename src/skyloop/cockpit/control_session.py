@@ -22,38 +22,9 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.commands import (
-    SETTLED_NS,
-    UNTOUCHED_S,
-    Alive,
-    Answer,
-    AnyCommand,
-    Fly,
-    FlyBack,
-    FlyRoute,
-    FollowTarget,
-    GoTo,
-    HandWatch,
-    HoverHere,
-    LandHere,
-    PauseRoute,
-    Release,
-    Reset,
-    ResumeRoute,
-    SelectTarget,
-    SetFollowMode,
-    SkipWaypoint,
-    Stop,
-    StopFollowing,
-    StopRoute,
-    Take,
-    TakeOff,
-    Write,
-    decode_command,
-    late_s,
-    untimely,
-)
-from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit import commands
+from skyloop.cockpit.commands import SETTLED_NS, UNTOUCHED_S, Alive, AnyCommand, Fly, decode_command, late_s, untimely
+from skyloop.cockpit.feeds import call_soon, start_task
 from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
 from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, RouteSession, to_place, to_start
 from skyloop.cockpit.stream import PageSocket
@@ -96,13 +67,8 @@ class ControlSession:
     ) -> None:
         """Prepare the session; :meth:`run` serves it.
 
-        Args:
-            socket: The socket, already accepted.
-            station: The drone.
-            person: The pilot's name, if known.
-            clock: The monotonic clock [ns].
-            photos: The folder for photos taken along routes; each drone has a subfolder.
-            follower: Creates followers for targets that the page marks.
+        ``photos``: the folder for photos taken along routes; each drone has a subfolder. ``follower``: creates
+        followers for targets that the page marks.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
@@ -126,38 +92,38 @@ class ControlSession:
         # The last command that replaced another one, and its first intent.
         self._last_command, self._first = ("", 0), 0
         self._decisions = 0  # counts commands that fly or end a flight; compared by jobs that have waited
-        self._hands = HandWatch()
+        self._hands = commands.HandWatch()
         self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
             None  # do, n, states that complete it, time of the start
         )
         self._repeated = False  # whether the take-off was repeated for as long as allowed
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # last refusal of a stick command: reason and time [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
-            Take: lambda command: self._run_in_turn(command, self._take),
-            Release: lambda command: self._run_in_turn(command, self._release),
-            Answer: lambda command: self._run_in_turn(command, self._answer),
-            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), UP),
-            HoverHere: self._hover_here,
-            LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
-            Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
-            Stop: lambda command: self._start_job(self._stop_motors(command)),
+            commands.Take: lambda command: self._run_in_turn(command, self._take),
+            commands.Release: lambda command: self._run_in_turn(command, self._release),
+            commands.Answer: lambda command: self._run_in_turn(command, self._answer),
+            commands.TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), UP),
+            commands.HoverHere: self._hover_here,
+            commands.LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
+            commands.Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
+            commands.Stop: lambda command: self._start_job(self._stop_motors(command)),
             Fly: self._fly,
-            GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
-            FlyBack: lambda command: self._set_out(command, to_start),
-            FlyRoute: lambda command: self._run_in_turn(
+            commands.GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
+            commands.FlyBack: lambda command: self._set_out(command, to_start),
+            commands.FlyRoute: lambda command: self._run_in_turn(
                 command, partial(self._fly_route, held=self._still_held(command))
             ),
-            PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
-            ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
-            SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
-            StopRoute: lambda command: self._steer_route(command, RouteSession.end),
-            SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
-            FollowTarget: lambda command: self._run_in_turn(
+            commands.PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
+            commands.ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
+            commands.SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
+            commands.StopRoute: lambda command: self._steer_route(command, RouteSession.end),
+            commands.SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
+            commands.FollowTarget: lambda command: self._run_in_turn(
                 command, partial(self._follow_target, held=self._still_held(command))
             ),
-            SetFollowMode: self._set_follow_mode,
-            StopFollowing: self._stop_following,
-            Write: lambda command: self._run_in_turn(command, self._write),
+            commands.SetFollowMode: self._set_follow_mode,
+            commands.StopFollowing: self._stop_following,
+            commands.Write: lambda command: self._run_in_turn(command, self._write),
         }
 
     @property
@@ -185,13 +151,13 @@ class ControlSession:
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
         """Carry out the page's commands. Of the stick commands that have queued up, use only the newest."""
-        commands: list[AnyCommand] = []
+        decoded: list[AnyCommand] = []
         for text in texts:
             try:
-                commands.append(decode_command(text))
+                decoded.append(decode_command(text))
             except DecodeError as error:
                 self._refuse("", 0, str(error))
-        for command, after in itertools.zip_longest(commands, commands[1:]):
+        for command, after in itertools.zip_longest(decoded, decoded[1:]):
             if not (isinstance(command, Fly) and isinstance(after, Fly)):
                 self._on_command(command)
 
@@ -204,12 +170,14 @@ class ControlSession:
             self._on_ping(command, now_ns)
             return
         try:
-            if problem and not (isinstance(command, HoverHere) and command.automatic):  # the page sends this only once
+            if problem and not (
+                isinstance(command, commands.HoverHere) and command.automatic
+            ):  # the page sends this only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
                 # A stop has its own connection, so refusals seen here never belong to it.
-                self._decided = self._decided if isinstance(command, Stop) else (command.do, command.n)
+                self._decided = self._decided if isinstance(command, commands.Stop) else (command.do, command.n)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
@@ -227,14 +195,7 @@ class ControlSession:
         """Send one command, ending the page's previous flight.
 
         The command is complete once it is sent or, if ``until`` names states, once the vehicle is in one of them.
-
-        Args:
-            command: The page's command.
-            act: Sends the command; returns whether it was sent.
-            until: The states that complete the command.
-
-        Raises:
-            SkyloopError: Any error from the drone; :class:`LinkError` if the command was not sent.
+        ``act``: sends the command; returns whether it was sent. ``until``: the states that complete the command.
         """
         pilot = self._held()
         self._send_now(pilot, act, command)
@@ -260,7 +221,7 @@ class ControlSession:
         with _else_hovering(pilot, "its replacement was refused"):
             yield
 
-    def _hover_here(self, command: HoverHere) -> None:
+    def _hover_here(self, command: commands.HoverHere) -> None:
         """Hover because the person decided so, or because the page reports that no key or stick is held."""
         if command.automatic:
             self._held()
@@ -290,7 +251,7 @@ class ControlSession:
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    async def _fly_route(self, command: FlyRoute, held: Callable[[], PilotConnection]) -> None:
+    async def _fly_route(self, command: commands.FlyRoute, held: Callable[[], PilotConnection]) -> None:
         """Check a route again, because much may have changed, and fly it."""
         route = self._station.routes.get(command.id)
         held()
@@ -310,29 +271,29 @@ class ControlSession:
         pilot, route = self._held(), self._route
         if route is None or route.law.over:
             raise RefusedError("no route is flown from this page")
-        if isinstance(command, ResumeRoute):
+        if isinstance(command, commands.ResumeRoute):
             self._end_flight()
         with _else_hovering(pilot, "its route can't be changed"):
             act(route)
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    async def _select_target(self, command: SelectTarget) -> None:
+    async def _select_target(self, command: commands.SelectTarget) -> None:
         await self._follow.select(command)
         self._acknowledge(command)
 
-    async def _follow_target(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
+    async def _follow_target(self, command: commands.FollowTarget, held: Callable[[], PilotConnection]) -> None:
         """Track the content of a box. Without a mode, this needs no authority."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    def _set_follow_mode(self, command: SetFollowMode) -> None:
+    def _set_follow_mode(self, command: commands.SetFollowMode) -> None:
         self._follow.fly(command, self._held())
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    def _stop_following(self, command: StopFollowing) -> None:
+    def _stop_following(self, command: commands.StopFollowing) -> None:
         self._follow.end()
         self._acknowledge(command)
 
@@ -349,7 +310,7 @@ class ControlSession:
             self._route.end(hover=False)
             self._route = None
 
-    async def _stop_motors(self, command: Stop) -> None:
+    async def _stop_motors(self, command: commands.Stop) -> None:
         """Stop the motors, retrying as long as the page shows the command as pending."""
         assert command.at_s is not None  # otherwise it would be untimely
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
@@ -360,7 +321,7 @@ class ControlSession:
         else:
             self._done(command.do, command.n)
 
-    async def _take(self, command: Take) -> None:
+    async def _take(self, command: commands.Take) -> None:
         pilot = self._pilot
         if pilot is None:
             pilot, self._first = await self._station.open_pilot(self.app), 0
@@ -387,7 +348,7 @@ class ControlSession:
         self._done(command.do, command.n)
         self._update()
 
-    async def _answer(self, command: Answer) -> None:
+    async def _answer(self, command: commands.Answer) -> None:
         pilot = self._held()
         self._acknowledge(command)
         if command.grant:
@@ -399,7 +360,7 @@ class ControlSession:
             raise
         self._done(command.do, command.n)
 
-    async def _release(self, command: Release) -> None:
+    async def _release(self, command: commands.Release) -> None:
         self.let_go("the page gives control back")
         self._authority.released()
         self._acknowledge(command)
@@ -414,7 +375,7 @@ class ControlSession:
         if pilot is not None:
             await self._station.close_pilot(pilot)
 
-    async def _write(self, command: Write) -> None:
+    async def _write(self, command: commands.Write) -> None:
         pilot = self._held()
 
         self._acknowledge(command)
@@ -429,8 +390,7 @@ class ControlSession:
     def _held(self) -> PilotConnection:
         """Return the connection that holds the authority.
 
-        Raises:
-            AuthorityError: The page does not hold the authority.
+        Raise ``AuthorityError`` if the page does not hold the authority.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
@@ -539,7 +499,7 @@ class ControlSession:
             self._observe_refusal(pilot)
         if self._awaited is not None and pilot is not None:
             do, n, states, from_ns = self._awaited
-            if do == TakeOff().do and not self._repeated:
+            if do == commands.TakeOff().do and not self._repeated:
                 patience_ns = _BEGUN_NS if pilot.is_acknowledged else _TAKEOFF_NS
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
@@ -568,7 +528,7 @@ class ControlSession:
             self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows whose
         if watched or self._place.is_under_way:
             self.let_go(outcome.text)  # this feedback also shows whether others have taken the vehicle
-        elif self._last_command[0] == TakeOff().do:
+        elif self._last_command[0] == commands.TakeOff().do:
             with suppress(SkyloopError):
                 pilot.idle()  # otherwise it would take off unexpectedly as soon as it can
         self._awaited = None
@@ -596,9 +556,7 @@ class ControlSession:
         self._start_job(self._run(command, work))
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
-        job = asyncio.create_task(work)
-        self._jobs.add(job)
-        job.add_done_callback(self._jobs.discard)
+        start_task(work, self._jobs)
 
     async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:
@@ -630,6 +588,6 @@ def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
 
 def _decides(command: AnyCommand) -> bool:
     """Return whether a command flies or ends a flight."""
-    if isinstance(command, FollowTarget):
+    if isinstance(command, commands.FollowTarget):
         return command.mode is not None
-    return not isinstance(command, Take | Answer | Write | SelectTarget | Alive)
+    return not isinstance(command, commands.Take | commands.Answer | commands.Write | commands.SelectTarget | Alive)

@@ -28,12 +28,7 @@ class Finder(Protocol):
     """Searches for proxies repeatedly, on threads other than the event loop's."""
 
     def __call__(self) -> list[Found]:
-        """Return the proxies that can be connected to now.
-
-        Raises:
-            SkyloopError: Searching is currently not possible.
-            OSError: Searching is currently not possible.
-        """
+        """Return the proxies that can be connected to now."""
 
     def add_name(self, name: str) -> None:
         """Also find this proxy, if the search is limited to certain names."""
@@ -46,11 +41,7 @@ class LocalFinder:
     """Finds the proxies on this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
-        """Prepare the search.
-
-        Args:
-            names: Search only for these; empty: all.
-        """
+        """Prepare the search. ``names``: search only for these; empty: all."""
         self._names = frozenset(names)
         self._also: set[str] = set()
         self._known: dict[tuple[str, Path], Found] = {}
@@ -93,10 +84,8 @@ class NetworkFinder:
     def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
         """Prepare the search.
 
-        Args:
-            local: Finds the proxies of this host.
-            settings: How to join the network.
-            wanted: Search only for these names; empty: all.
+        ``local``: finds the proxies of this host. ``settings``: how to join the network. ``wanted``: search only for
+        these names; empty: all.
         """
         self._local = local
         self._settings = settings

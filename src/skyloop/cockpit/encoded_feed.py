@@ -20,7 +20,7 @@ import msgspec
 
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.cockpit.feeds import Cancellable, Wake, call_soon
+from skyloop.cockpit.feeds import Wake, call_soon
 from skyloop.extend import stream_channel
 from skyloop.messages import CameraInfo, EncodedFrame
 
@@ -66,13 +66,7 @@ class Numbered(Generic[P]):
 
 
 class CameraFeed:
-    """The newest frame of one camera, encoded at most once for all pages, and only while a page shows it.
-
-    Args:
-        drone: The drone.
-        camera: The camera's name.
-        clock: The monotonic clock [ns].
-    """
+    """The newest frame of one camera, encoded at most once for all pages, and only while a page shows it."""
 
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
@@ -81,7 +75,7 @@ class CameraFeed:
         self._drone = drone
         self._clock = clock
         self._since_ns = 0  # when the first page subscribed
-        self._listener: Cancellable | None = None
+        self._listener: Listener[Any] | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
         self._jpeg: tuple[int, asyncio.Future[bytes]] | None = None
@@ -144,12 +138,7 @@ class CameraFeed:
 def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
     """Encode a frame (BGR) as a JPEG file.
 
-    Args:
-        frame: The frame.
-        quality: 1 to 100.
-
-    Raises:
-        ValueError: OpenCV could not encode the frame.
+    ``quality``: 1 to 100. Raise ``ValueError`` if OpenCV could not encode the frame.
     """
     import cv2
 
@@ -185,11 +174,7 @@ class SmallFrame:
 class SmallFeed:
     """One camera's newest frame in one size, as a JPEG file, while a page shows it. Used on the event loop.
 
-    Args:
-        drone: The drone.
-        camera: The camera.
-        width: The width to scale down to [pixels]; smaller frames are left unchanged.
-        clock: The monotonic clock [ns].
+    ``width``: the width to scale down to [pixels]; smaller frames are left unchanged.
     """
 
     def __init__(self, drone: Drone, camera: CameraInfo, width: int, clock: Clock = monotonic_ns) -> None:
@@ -224,8 +209,7 @@ class SmallFeed:
     def subscribe(self) -> None:
         """Add a page that shows the camera; the first one subscribes to the camera.
 
-        Raises:
-            SkyloopError: The drone was closed, or no longer has this camera.
+        Raise ``SkyloopError`` if the drone was closed, or no longer has this camera.
         """
         if self._listener is None:
             self._since_ns = self._clock()
@@ -284,10 +268,8 @@ class Form:
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
     """Choose the form that all panes of about the same size share.
 
-    Args:
-        camera: The camera.
-        width: Width of the pane [device pixels]; 0: full size.
-        max_fps: Maximum number of pictures per second; None: all.
+    ``width``: width of the pane [device pixels]; 0: full size. ``max_fps``: maximum number of pictures per second;
+    None: all.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -301,14 +283,7 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
 
 
 class EncodedFeed:
-    """The newest pictures in one form, while a page shows them. Created and used on the event loop.
-
-    Args:
-        drone: The drone.
-        camera: The camera's name.
-        form: How the pictures are encoded.
-        clock: The monotonic clock [ns].
-    """
+    """The newest pictures in one form, while a page shows them. Created and used on the event loop."""
 
     encoded = 0  #: number of frames encoded here: none
 
@@ -358,12 +333,8 @@ class EncodedFeed:
     def subscribe(self, page: object, wake: Wake | None) -> None:
         """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key picture.
 
-        Args:
-            page: Identifies the page.
-            wake: Called on the event loop for each picture; None if the page polls.
-
-        Raises:
-            SkyloopError: The drone was closed, or no longer has this camera.
+        ``wake``: called on the event loop for each picture; None if the page polls. Raise ``SkyloopError`` if the drone
+        was closed, or no longer has this camera.
         """
         if self._channel is None:
             form = self.form
@@ -377,7 +348,7 @@ class EncodedFeed:
             )
             self._loop = asyncio.get_running_loop()
             self._came_ns = self._clock()
-            channel.add(self._put, _none_dropped)
+            channel.add(self._put, lambda: 0)
             self._channel = channel
         with self._lock:
             self._wakes[page] = wake
@@ -400,9 +371,8 @@ class EncodedFeed:
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
         """Return the next pictures for a page, in order, and how many it misses before them.
 
-        Args:
-            serial: Number of the last picture sent to the page; 0: none yet.
-            follows: Whether the page can decode the next picture; if not, it resumes at a key picture.
+        ``serial``: number of the last picture sent to the page; 0: none yet. ``follows``: whether the page can decode
+        the next picture; if not, it resumes at a key picture.
         """
         with self._lock:
             newer = [one for one in self._pictures if one.serial > serial]
@@ -445,7 +415,3 @@ class EncodedFeed:
         if self._loop is not None:
             for wake in wakes:
                 call_soon(self._loop, wake)
-
-
-def _none_dropped() -> int:
-    return 0

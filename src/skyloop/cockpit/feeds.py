@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
@@ -18,7 +20,7 @@ from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyl
 from skyloop.messages.relayed import MOCAP as SERIES
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone
+    from skyloop.client import Drone, Listener
 
 ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
@@ -39,16 +41,17 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-class Cancellable(Protocol):
-    """The result of registering a callback with a drone."""
-
-    def cancel(self) -> None: ...
-
-
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
     """Call a function on the loop, from any thread. Do nothing if the loop is closed, because no pages are left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
+
+
+def start_task(work: Coroutine[Any, Any, None], running: set[asyncio.Task[None]]) -> None:
+    """Run a coroutine as a task, which stays in the set until it has ended: the loop itself keeps no task alive."""
+    task = asyncio.create_task(work)
+    running.add(task)
+    task.add_done_callback(running.discard)
 
 
 class PeriodicBroadcast:
@@ -57,10 +60,7 @@ class PeriodicBroadcast:
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
         """Initialise without starting; the first subscriber starts it.
 
-        Args:
-            period_s: Time between two messages [s].
-            make: Creates a message.
-            on_change: Called with True before the first subscriber is added, and with False after the last has left.
+        ``on_change``: called with True before the first subscriber is added, and with False after the last has left.
         """
         self.message = b""  #: the newest message
         self.closed = False  #: whether no more messages will be created
@@ -152,21 +152,16 @@ class Newest(Generic[K, V]):
         self._values = {}
 
 
+@dataclass
 class Drawing:
     """A drawing for pages, encoded once for all of them."""
 
-    __slots__ = ("_text", "annotation")
+    annotation: Annotation
 
-    def __init__(self, annotation: Annotation) -> None:
-        self.annotation = annotation
-        self._text: str | None = None
-
-    @property
+    @cached_property
     def text(self) -> str:
         """The JSON message sent to pages."""
-        if self._text is None:
-            self._text = _encode(drawing_values(self.annotation)).decode()
-        return self._text
+        return _encode(drawing_values(self.annotation)).decode()
 
 
 def drawing_values(annotation: Annotation) -> dict[str, Any]:
@@ -193,10 +188,6 @@ class EventFeed:
     """The drone's annotations and events.
 
     Events are numbered here, because events created by the client have no number.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -206,7 +197,7 @@ class EventFeed:
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
         self._waking = False  # a wake-up of the pages has been scheduled
-        self._listeners: list[Cancellable] = [
+        self._listeners: list[Listener[Any]] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
@@ -249,10 +240,6 @@ class LogFeed:
     """The logs of applications, and the command last applied.
 
     Subscribed to only on demand, to save the proxy work. The client's receiving thread replaces the values as a whole.
-
-    Args:
-        drone: The drone.
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -262,7 +249,7 @@ class LogFeed:
         self._numbers: Newest[str, float] = Newest(MAX_SERIES, clock)
         self._waypoints: tuple[int, tuple[tuple[float, ...], ...]] | None = None
         self._mocap: tuple[int, tuple[float, ...]] | None = None
-        self._listeners: list[Cancellable] = []
+        self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
         """Subscribe; or unsubscribe and forget the values."""
@@ -290,8 +277,7 @@ class LogFeed:
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
         """Return the array ``waypoints`` that was logged last, if within :data:`KEPT_S`.
 
-        Returns:
-            Rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
+        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
         """
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
@@ -299,8 +285,7 @@ class LogFeed:
     def mocap(self) -> tuple[float, ...] | None:
         """Return the newest pose from motion capture.
 
-        Returns:
-            x, y, z [m] and quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
+        Return x, y, z [m] and quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
         """
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None

@@ -20,11 +20,11 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import Alarm, AlarmSeverity
 from skyloop.cockpit.commands import SETTLED_NS, Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
 from skyloop.cockpit.discovery import Finder, Found
-from skyloop.cockpit.feeds import PeriodicBroadcast
+from skyloop.cockpit.feeds import PeriodicBroadcast, start_task
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.telemetry import encode_json
-from skyloop.errors import DecodeError, LinkError, SkyloopError
+from skyloop.errors import DecodeError, LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import HIGHEST_PRIORITY, FlightState, Land, LinkState
 
 if TYPE_CHECKING:
@@ -49,8 +49,7 @@ Json = dict[str, Any]
 def observe(found: Found) -> Drone:
     """Connect to a proxy as an observer.
 
-    Raises:
-        SkyloopError: The connection was not established within :data:`CONNECT_S`.
+    Raise ``SkyloopError`` if the connection was not established within :data:`CONNECT_S`.
     """
     from skyloop.client.drone import open_drone
 
@@ -60,12 +59,7 @@ def observe(found: Found) -> Drone:
 class Fleet:
     """The stations, by drone name.
 
-    Args:
-        finder: Finds proxies.
-        connect: Connects to a proxy; called on threads.
-        kept: Names that stay listed once found.
-        clock: The monotonic clock [ns].
-        look_s: Interval between searches [s].
+    ``connect``: connects to a proxy; called on threads. ``kept``: names that stay listed once found.
     """
 
     def __init__(
@@ -112,17 +106,10 @@ class Fleet:
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Start work that continues even after the page that requested it is gone."""
-        task = asyncio.create_task(work)
-        self._begun.add(task)
-        task.add_done_callback(self._begun.discard)
+        start_task(work, self._begun)
 
     async def search(self) -> None:
-        """Search once: start connecting to new proxies, and remove those that are gone for good.
-
-        Raises:
-            SkyloopError: Searching is currently not possible.
-            OSError: Searching is currently not possible.
-        """
+        """Search once: start connecting to new proxies, and remove those that are gone for good."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -141,22 +128,22 @@ class Fleet:
             elif self._forgotten(name, station, now_ns):
                 self.let_go(name)
 
+    def station(self, name: str) -> Station:
+        """Return a drone's station; raise :class:`UnknownNameError` if there is none."""
+        if name not in self.stations:
+            raise UnknownNameError("drone", name, self.stations)
+        return self.stations[name]
+
     @property
     def unreached(self) -> dict[str, str]:
         """Drones that were found but can't be commanded because they are not connected; reasons by name."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
-    def want(self, name: str) -> None:
-        """Also show this drone, if the view is limited to certain names."""
-        self.finder.add_name(name)
-
     def let_go(self, name: str) -> None:
         """Remove a drone; if it is found again, it reappears. Do nothing if the name is unknown."""
         if name in self.stations:
-            task = asyncio.create_task(self.stations.pop(name).close())
-            self._closing.add(task)
-            task.add_done_callback(self._closing.discard)
+            start_task(self.stations.pop(name).close(), self._closing)
 
     def _forgotten(self, name: str, station: Station, now_ns: int) -> bool:
         gone_ns = now_ns - self._seen_ns.get(name, now_ns)
@@ -185,13 +172,7 @@ class Fleet:
 
 
 class Overview:
-    """All drones in one message, created twice a second for all pages.
-
-    Args:
-        fleet: The drones.
-        recordings: The recordings of the same drones.
-        period_s: Time between two messages [s].
-    """
+    """All drones in one message, created twice a second for all pages."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
         self._fleet = fleet
@@ -238,14 +219,7 @@ class FleetSession:
     """Serves one socket of a pilot's page; its commands complete even if the page goes away. On the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
-        """Prepare the session; :meth:`run` serves it.
-
-        Args:
-            socket: The socket, already accepted.
-            fleet: The drones.
-            person: The pilot's name, if known.
-            clock: The monotonic clock [ns].
-        """
+        """Prepare the session; :meth:`run` serves it."""
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._fleet = fleet

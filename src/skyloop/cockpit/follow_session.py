@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.feeds import call_soon, start_task
 from skyloop.cockpit.place_flight import UP
 from skyloop.cockpit.target_tracker import Follower, FrameKeeper, TargetTracker, TrackReport
 from skyloop.cockpit.telemetry import number, vector
@@ -61,12 +61,8 @@ class FollowerFactory(Protocol):
 class FollowSession:
     """Tracks one target at a time for a page and follows it. On the event loop.
 
-    Args:
-        drone: Provides the frames; may be connected as an observer.
-        send: Sends a message to the page.
-        clear: Ends the page's other flights; called before the first set-point.
-        make: Creates followers; called on a thread.
-        clock: This process's monotonic clock [ns].
+    ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; called
+    before the first set-point. ``make``: creates followers; called on a thread.
     """
 
     def __init__(
@@ -110,9 +106,7 @@ class FollowSession:
     async def select(self, command: SelectTarget) -> None:
         """Keep the frames of a camera until a box arrives or the page cancels.
 
-        Raises:
-            UnknownNameError: The vehicle has no such camera.
-            MissingExtraError: OpenCV is not installed.
+        Raise ``UnknownNameError`` if the vehicle has no such camera.
         """
         if self._keeper is not None:
             self._keeper.close()
@@ -175,9 +169,8 @@ class FollowSession:
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
         """Follow the tracked target, or change the mode of following.
 
-        Raises:
-            RefusedError: Nothing is tracked, or the vehicle is not in the air.
-            UsageError: The mode or distance is invalid.
+        Raise ``RefusedError`` if nothing is tracked, or the vehicle is not in the air, or ``UsageError`` if the mode or
+        distance is invalid.
         """
         tracker = self._tracker
         if tracker is None:
@@ -201,17 +194,14 @@ class FollowSession:
     def end(self, why: str = "", *, hover: bool = True) -> None:
         """Forget the target.
 
-        Args:
-            why: The reason shown on the page; empty if the person requested it.
-            hover: Whether to hover if the vehicle was following; False if something else is commanded.
+        ``why``: the reason shown on the page; empty if the person requested it. ``hover``: whether to hover if the
+        vehicle was following; False if something else is commanded.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:
             return
         tracker.close()
-        ending = asyncio.create_task(asyncio.to_thread(tracker.join, JOIN_S))
-        self._ending.add(ending)
-        ending.add_done_callback(self._ending.discard)
+        start_task(asyncio.to_thread(tracker.join, JOIN_S), self._ending)
         self._tracker = self._pilot = self._action = None
         self._flying, self._waits = False, ""
         if self._watch is not None:
@@ -343,12 +333,7 @@ class FollowSession:
 
 
 def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
-    """Convert a command's box to pixels of the frame, even if the page received the picture in another size.
-
-    Args:
-        command: The page's command.
-        header: The header of the frame under the box.
-    """
+    """Convert a command's box to pixels of the frame, even if the page received the picture in another size."""
     x, y, width, height = command.box
     if command.size is None:
         return command.box

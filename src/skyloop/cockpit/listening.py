@@ -25,6 +25,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.access import Person
+from skyloop.cockpit.feeds import start_task
 from skyloop.messages import Role
 
 MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
@@ -119,13 +120,7 @@ class Admission:
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
         """Record that a complete request arrived.
 
-        Args:
-            connection: The connection that the request arrived on.
-            person: Who sent it; None for a stranger.
-            now_ns: The monotonic clock [ns].
-
-        Returns:
-            Why the request is refused; empty if it is not.
+        ``person``: who sent it; None for a stranger. Return why the request is refused; empty if it is not.
         """
         if person is None:
             connection.asked = True
@@ -219,15 +214,7 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop.
-
-    Args:
-        listening: The listening socket, already bound.
-        admission: Counts the connections.
-        protocol: Creates the HTTP protocol for a connection.
-        tls: The TLS context for HTTPS.
-        clock: The monotonic clock [ns].
-    """
+    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop."""
 
     def __init__(
         self,
@@ -282,9 +269,7 @@ class Listener:
         connection = Connection(address, lambda: _shut(accepted))
         accepted.on_close = lambda: self._admission.closed(connection)
         self._admission.opened(connection, self._clock())
-        task = asyncio.create_task(self._hand_over(accepted, connection))
-        self._handing_over.add(task)
-        task.add_done_callback(self._handing_over.discard)
+        start_task(self._hand_over(accepted, connection), self._handing_over)
 
     async def _hand_over(self, accepted: _Accepted, connection: Connection) -> None:
         timeout_s = None if self._tls is None else HEADER_S
@@ -331,10 +316,6 @@ class RepeatLimit(logging.Filter):
 
     Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
     one that it passed longest ago.
-
-    Args:
-        every_s: The period [s].
-        clock: The monotonic clock [ns].
     """
 
     def __init__(self, every_s: float = 10.0, clock: Clock = monotonic_ns) -> None:
@@ -344,7 +325,6 @@ class RepeatLimit(logging.Filter):
         self._logged: dict[str, tuple[int, int]] = {}  # by message without values: time, number dropped since
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log a record."""
         key, now_ns = f"{record.name} {record.msg}", self._clock()
         logged_ns, left_out = self._logged.get(key, (None, 0))
         if logged_ns is not None and now_ns - logged_ns < self._every_ns:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.actions import ReturnWatch, position_action
+from skyloop.cockpit.feeds import start_task
 from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto, save_photo
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import LinkError, RefusedError, SkyloopError
@@ -31,26 +32,18 @@ UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A flight to one place.
+    """A flight to one place."""
 
-    Attributes:
-        action: The command to send.
-        goal: The place to fly to.
-        is_over: Returns whether the newest feedback shows that the flight is over.
-    """
-
-    action: Position | ReturnToStart
-    goal: Waypoint
-    is_over: Callable[[Feedback], bool]
+    action: Position | ReturnToStart  #: the command to send
+    goal: Waypoint  #: the place to fly to
+    is_over: Callable[[Feedback], bool]  #: returns whether the newest feedback shows that the flight is over
 
 
 def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
     """Return the flight to the place given in a command.
 
-    Raises:
-        RefusedError: The vehicle can't currently be flown to places.
-        UsageError: A coordinate is out of range.
-        LinkError: No feedback has been received.
+    Raise ``RefusedError`` if the vehicle can't currently be flown to places, ``UsageError`` if a coordinate is out of
+    range, or ``LinkError`` if no feedback has been received.
     """
     _fit_for_places(pilot, "it can't be flown to a place")
     goal = Waypoint(command.x, command.y, command.z, command.yaw)
@@ -61,9 +54,8 @@ def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
 def to_start(pilot: PilotConnection) -> Leg:
     """Return the flight back to the take-off position.
 
-    Raises:
-        RefusedError: The vehicle can't currently be flown to places, or its take-off position is unknown.
-        LinkError: No feedback has been received.
+    Raise ``RefusedError`` if the vehicle can't currently be flown to places, or its take-off position is unknown, or
+    ``LinkError`` if no feedback has been received.
     """
     start = _fit_for_places(pilot, "it can't return to its start").start_position_m
     if start is None:
@@ -79,13 +71,8 @@ def to_start(pilot: PilotConnection) -> Leg:
 class PlaceFlight:
     """Monitors one flight to a place at a time, and shows its goal.
 
-    A flight ends on arrival or at the first problem.
-
-    Args:
-        station: The drone.
-        app: The name under which the page flies.
-        done: Called on arrival, with the command's kind and number.
-        refused: Called if the flight ended before arrival, with the command's kind and number, and the reason.
+    A flight ends on arrival or at the first problem. ``done``: called on arrival, with the command's kind and number.
+    ``refused``: called if the flight ended before arrival, with the command's kind and number, and the reason.
     """
 
     def __init__(
@@ -99,7 +86,6 @@ class PlaceFlight:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a flight is under way."""
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
@@ -151,16 +137,7 @@ OLD_S: Final = 1.0  #: a route is paused if feedback is older than this
 
 
 class RouteSession:
-    """A page's flight along a route.
-
-    Args:
-        route: The route, already checked.
-        pilot: The connection that holds the authority.
-        drone: Provides the frames to save.
-        folder: Where photos are saved.
-        send: Sends a message to the page.
-        aim: Called with the current goal, or None.
-    """
+    """A page's flight along a route. ``aim``: called with the current goal, or None."""
 
     def __init__(
         self,
@@ -189,8 +166,7 @@ class RouteSession:
     def begin(self) -> None:
         """Fly to the first waypoint, and monitor the flight in a task until :meth:`end`.
 
-        Raises:
-            SkyloopError: The drone is on the ground, its position is unknown, or the command was not sent.
+        Raise ``SkyloopError`` if the drone is on the ground, its position is unknown, or the command was not sent.
         """
         self._carry_out(self.law.start(self._pilot.feedback(max_age_s=OLD_S)))
         self._job = asyncio.create_task(self._watch())
@@ -200,11 +176,9 @@ class RouteSession:
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
-        """Resume the flight."""
         self._ask(self.law.resume)
 
     def skip(self) -> None:
-        """Skip the current waypoint."""
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
@@ -245,9 +219,7 @@ class RouteSession:
                 if send:
                     self._command(effect.action, automatic=automatic)
             elif isinstance(effect, TakePhoto):
-                task = asyncio.create_task(self._photograph(effect))
-                self._photos.add(task)
-                task.add_done_callback(self._photos.discard)
+                start_task(self._photograph(effect), self._photos)
             else:
                 self._send_progress(effect)
         if effects:

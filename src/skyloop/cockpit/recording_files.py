@@ -50,8 +50,7 @@ class Notes(msgspec.Struct, frozen=True):
 def check_name(text: str) -> str:
     """Return the file name, including suffix, for a recording's name typed by a person.
 
-    Raises:
-        UsageError: The name is invalid; the message says why.
+    Raise ``UsageError`` if the name is invalid; the message says why.
     """
     name = unicodedata.normalize("NFC", text).strip()
     name = name.removesuffix(ENDING).rstrip()
@@ -75,11 +74,7 @@ def notes_path(path: Path) -> Path:
 
 
 def read_notes(path: Path) -> Notes:
-    """Return the notes of a recording.
-
-    Raises:
-        FileFormatError: The notes file can't be read.
-    """
+    """Return the notes of a recording. Raise ``FileFormatError`` if the notes file can't be read."""
     if not notes_path(path).exists():
         return Notes()
     return files.read_json(notes_path(path), Notes, "notes of a recording", _MOST_BYTES)
@@ -88,9 +83,8 @@ def read_notes(path: Path) -> Notes:
 def write_text(path: Path, text: str) -> Notes:
     """Write a recording's note; an empty note is removed.
 
-    Raises:
-        UsageError: The note is too long or can't be written.
-        FileFormatError: The existing notes file can't be read and is therefore not overwritten.
+    Raise ``UsageError`` if the note is too long or can't be written, or ``FileFormatError`` if the existing notes file
+    can't be read and is therefore not overwritten.
     """
     if len(text) > MAX_TEXT:
         raise UsageError(f"a note has at most {MAX_TEXT} characters, not {len(text)}")
@@ -100,9 +94,7 @@ def write_text(path: Path, text: str) -> Notes:
 def add_mark(path: Path, at_s: float, text: str) -> Notes:
     """Add a mark to a recording.
 
-    Raises:
-        UsageError: The position is invalid, the text too long, or there are too many marks.
-        FileFormatError: As for :func:`write_text`.
+    Raise ``UsageError`` if the position is invalid, the text too long, or there are too many marks.
     """
     if not (math.isfinite(at_s) and 0.0 <= at_s <= MAX_AT_S):
         raise UsageError(f"a mark is at 0 to {MAX_AT_S:g} s of the recording, not at {at_s!r}")
@@ -115,12 +107,7 @@ def add_mark(path: Path, at_s: float, text: str) -> Notes:
 
 
 def remove_mark(path: Path, mark: Mark) -> Notes:
-    """Remove a mark from a recording.
-
-    Raises:
-        UnknownNameError: The recording has no such mark.
-        FileFormatError: As for :func:`write_text`.
-    """
+    """Remove a mark from a recording. Raise ``UnknownNameError`` if the recording has no such mark."""
     notes = read_notes(path)
     if mark not in notes.marks:
         raise UnknownNameError("mark", f"{mark.at_s:g} s {mark.text}", [f"{m.at_s:g} s {m.text}" for m in notes.marks])
@@ -130,11 +117,7 @@ def remove_mark(path: Path, mark: Mark) -> Notes:
 
 
 def check_mark(text: str) -> None:
-    """Check the text of a mark.
-
-    Raises:
-        UsageError: The text is too long.
-    """
+    """Check the text of a mark. Raise ``UsageError`` if the text is too long."""
     if len(text) > MAX_MARK:
         raise UsageError(f"a mark has at most {MAX_MARK} characters, not {len(text)}")
 
@@ -142,12 +125,8 @@ def check_mark(text: str) -> None:
 def rename(path: Path, name: str) -> str:
     """Rename a recording and its notes.
 
-    Returns:
-        The new name.
-
-    Raises:
-        UsageError: The name is invalid, or the file can't be moved.
-        RefusedError: A file with that name already exists.
+    Raise ``UsageError`` if the name is invalid, or the file can't be moved, or ``RefusedError`` if a file with that
+    name already exists.
     """
     target = path.with_name(check_name(name))
     if target != path:
@@ -158,11 +137,8 @@ def rename(path: Path, name: str) -> str:
 def throw_away(path: Path) -> str:
     """Move a recording and its notes to the trash.
 
-    Returns:
-        The recording's name in the trash, with a number if its own name was taken.
-
-    Raises:
-        UsageError: A file can't be moved.
+    Return the recording's name in the trash, with a number if its own name was taken. Raise ``UsageError`` if a file
+    can't be moved.
     """
     trash = path.parent / TRASH
     try:
@@ -179,10 +155,8 @@ def throw_away(path: Path) -> str:
 def bring_back(folder: Path, name: str) -> str:
     """Move a recording and its notes from the trash back into the folder.
 
-    Raises:
-        UnknownNameError: The recording is not in the trash.
-        RefusedError: A file with that name already exists in the folder.
-        UsageError: A file can't be moved.
+    Raise ``UnknownNameError`` if the recording is not in the trash, ``RefusedError`` if a file with that name already
+    exists in the folder, or ``UsageError`` if a file can't be moved.
     """
     thrown = {path.name: path for path in _recordings(folder / TRASH)}
     if name not in thrown:
@@ -201,11 +175,7 @@ def trash_of(folder: Path) -> dict[str, int]:
 
 
 def empty_trash(folder: Path) -> None:
-    """Permanently delete everything in the trash.
-
-    Raises:
-        UsageError: A file can't be deleted.
-    """
+    """Permanently delete everything in the trash. Raise ``UsageError`` if a file can't be deleted."""
     for path in list(_recordings(folder / TRASH)):
         try:
             path.unlink(missing_ok=True)

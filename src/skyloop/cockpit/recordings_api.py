@@ -14,14 +14,12 @@ from starlette.routing import Route
 
 from skyloop.cockpit import recording_files
 from skyloop.cockpit.api import answer_json, answered, body_of, check_json, while_wanted
-from skyloop.cockpit.reports import MARK
-from skyloop.errors import UnknownNameError, UsageError
+from skyloop.cockpit.recordings import MARK, Recordings
+from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recording_files import Notes
-    from skyloop.cockpit.recordings import Recordings
-    from skyloop.cockpit.station import Station
 
 #: A report is a complete page with an inline script; it runs without this page's permissions.
 _REPORT_POLICY: Final = (
@@ -30,7 +28,9 @@ _REPORT_POLICY: Final = (
 )
 #: A replay's parameters, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = 16_384  #: maximum length of any text in a request; each use has a lower limit and reports it
+_MOST_CHARACTERS: Final = (
+    16_384  #: maximum length of a name or a text in a request; each use has a lower limit and reports it
+)
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -44,11 +44,6 @@ class _Name(msgspec.Struct):
 
 class _Words(msgspec.Struct):
     text: _Text
-
-
-class _Mark(msgspec.Struct):
-    at_s: float
-    text: _Text = ""
 
 
 class _Replay(msgspec.Struct):
@@ -69,7 +64,6 @@ class RecordingsApi:
         self._recordings = recordings
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         one = "/api/recordings/{name}"
         return [
             Route("/api/recordings", self.recordings, methods=["GET"]),
@@ -101,15 +95,13 @@ class RecordingsApi:
 
     @answered
     async def record(self, request: Request) -> Response:
-        """Start a recording."""
         wanted = await body_of(request, _Wanted)
         for name in wanted.drones:
-            self._station(name)
+            self._fleet.station(name)
         return answer_json(await self._recordings.start(wanted.drones), 201)
 
     @answered
     async def stop(self, request: Request) -> Response:
-        """Stop a recording."""
         check_json(request)
         return answer_json(await self._recordings.stop(request.path_params["number"]))
 
@@ -146,27 +138,21 @@ class RecordingsApi:
 
     @answered
     async def write_note(self, request: Request) -> Response:
-        """Write the note of a recording."""
         text = (await body_of(request, _Words)).text
         return await self._annotate(request, lambda path: recording_files.write_text(path, text))
 
     @answered
     async def add_mark(self, request: Request) -> Response:
-        """Add a mark to a recording."""
-        mark = await body_of(request, _Mark)
+        mark = await body_of(request, recording_files.Mark)
         return await self._annotate(request, lambda path: recording_files.add_mark(path, mark.at_s, mark.text), 201)
 
     @answered
     async def remove_mark(self, request: Request) -> Response:
-        """Remove a mark from a recording."""
-        mark = await body_of(request, _Mark)
-        return await self._annotate(
-            request, lambda path: recording_files.remove_mark(path, recording_files.Mark(mark.at_s, mark.text))
-        )
+        mark = await body_of(request, recording_files.Mark)
+        return await self._annotate(request, lambda path: recording_files.remove_mark(path, mark))
 
     @answered
     async def rename(self, request: Request) -> Response:
-        """Rename a recording."""
         new = (await body_of(request, _Name)).name
         recording_files.check_name(new)
         return await self._move(request, lambda path: recording_files.rename(path, new))
@@ -187,7 +173,6 @@ class RecordingsApi:
 
     @answered
     async def empty_trash(self, request: Request) -> Response:
-        """Empty the trash."""
         check_json(request)
         await self._recordings.in_trash(recording_files.empty_trash)
         return answer_json({})
@@ -196,10 +181,9 @@ class RecordingsApi:
 
     @answered
     async def replay(self, request: Request) -> Response:
-        """Replay a recording."""
         wanted = await body_of(request, _Replay)
         name = await self._recordings.replay(request.path_params["name"], wanted.drone)
-        self._fleet.want(name)
+        self._fleet.finder.add_name(name)
         await self._fleet.search()
         return answer_json({"drone": name}, 201)
 
@@ -213,7 +197,7 @@ class RecordingsApi:
         """Pause, resume or move a replay, or change its speed; answer once the replay has accepted the change."""
         wanted = await body_of(request, _Playback)
         name = request.path_params["name"]
-        station = self._station(name)
+        station = self._fleet.station(name)
         if not station.drone.uri.startswith("replay:"):
             raise UsageError(f"{name} is not a replay: it can't be paused or moved")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
@@ -227,7 +211,6 @@ class RecordingsApi:
 
     @answered
     async def end_replay(self, request: Request) -> Response:
-        """End a replay."""
         check_json(request)
         name = request.path_params["name"]
         await self._recordings.end_replay(name)
@@ -239,9 +222,3 @@ class RecordingsApi:
 
     async def _move(self, request: Request, change: Callable[[Path], str]) -> Response:
         return answer_json({"name": await self._recordings.move(request.path_params["name"], change)})
-
-    def _station(self, name: str) -> Station:
-        stations = self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
-        return stations[name]

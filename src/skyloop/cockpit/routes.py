@@ -23,8 +23,7 @@ Json = dict[str, Any]
 class RouteFiles:
     """The routes in one folder, each in a file ``NAME.route.json``. Methods access files, so call them on a thread.
 
-    Args:
-        folder: Created when needed.
+    ``folder``: created when needed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,9 +37,7 @@ class RouteFiles:
     def load(self, name: str) -> Route:
         """Read a route.
 
-        Raises:
-            UnknownNameError: There is no route with that name.
-            SkyloopError: The file can't be read.
+        Raise ``UnknownNameError`` if there is no route with that name, or ``SkyloopError`` if the file can't be read.
         """
         path = self._path(name)
         if not path.is_file():
@@ -50,9 +47,8 @@ class RouteFiles:
     def save(self, name: str, route: Route) -> None:
         """Write a route, replacing any with the same name.
 
-        Raises:
-            UsageError: The name is invalid, or the file can't be written.
-            RefusedError: There are already :data:`MOST_FILES` routes.
+        Raise ``UsageError`` if the name is invalid, or the file can't be written, or ``RefusedError`` if there are
+        already :data:`MOST_FILES` routes.
         """
         path = self._path(name)
         if not path.exists() and len(self._files()) >= MOST_FILES:
@@ -66,9 +62,8 @@ class RouteFiles:
     def delete(self, name: str) -> None:
         """Delete a route.
 
-        Raises:
-            UnknownNameError: There is no route with that name.
-            UsageError: The name is invalid, or the file can't be deleted.
+        Raise ``UnknownNameError`` if there is no route with that name, or ``UsageError`` if the name is invalid, or the
+        file can't be deleted.
         """
         path = self._path(name)
         try:
@@ -112,8 +107,7 @@ class CheckedRoutes:
     def get(self, number: str) -> Route:
         """Return a checked route.
 
-        Raises:
-            RefusedError: The route was not checked, or too many others have been checked since.
+        Raise ``RefusedError`` if the route was not checked, or too many others have been checked since.
         """
         if number not in self._routes:
             raise RefusedError("this route was not checked recently: check it again")

@@ -43,8 +43,7 @@ _USUAL_PORT: Final = {"http": 80, "https": 443}
 def bind_address(host: str) -> tuple[str, bool]:
     """Return the address to bind to, and whether it is a loopback address.
 
-    Raises:
-        UsageError: The text is not an address.
+    Raise ``UsageError`` if the text is not an address.
     """
     if host == "localhost":
         return "127.0.0.1", True
@@ -86,14 +85,7 @@ class Names:
 
 
 def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
-    """Return the names by which a server can be reached.
-
-    Args:
-        address: The address it listens on.
-        port: The port it listens on.
-        more: Further host names by which browsers reach it.
-        scheme: ``http`` or ``https``.
-    """
+    """Return the names by which a server can be reached. ``more``: further host names by which browsers reach it."""
     known = ipaddress.ip_address(address)
     bare = {name.lower() for name in more}
     if known.is_loopback:
@@ -193,12 +185,8 @@ def person_of(scope: Scope) -> Person | None:
 async def gone_within(receive: Receive, within_s: float) -> bool:
     """Wait for the client to disconnect.
 
-    Args:
-        receive: The request's function of that name; other messages are dropped.
-        within_s: How long to wait [s].
-
-    Returns:
-        Whether the client disconnected in time.
+    ``receive``: the request's function of that name; other messages are dropped. Return whether the client disconnected
+    in time.
     """
     try:
         async with asyncio.timeout(within_s):

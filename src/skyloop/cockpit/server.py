@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import socket
 import ssl
 import sys
 import threading
@@ -27,10 +26,9 @@ if TYPE_CHECKING:
     import uvicorn
     from starlette.applications import Starlette
 
-    from skyloop.cockpit.access import Gate
+    from skyloop.cockpit.access import Gate, SessionFile
     from skyloop.cockpit.discovery import Finder
     from skyloop.cockpit.fleet import Fleet
-    from skyloop.cockpit.sessions import SessionFile
     from skyloop.cockpit.station import Station
     from skyloop.messages.parameter import WorldGeometry
     from skyloop.metrics.endpoint import Source
@@ -130,7 +128,7 @@ def serve_cockpit(
         raise MissingExtraError("the cockpit", "cockpit", cause=str(error)) from error
     from skyloop.cockpit.access import TokenGate
     from skyloop.cockpit.addresses import Announcer
-    from skyloop.cockpit.security import bind_address
+    from skyloop.cockpit.security import bind_address, own_names
 
     access = access or Access()
     address, loopback = bind_address(access.host)
@@ -141,19 +139,42 @@ def serve_cockpit(
             "port over SSH"
         )
     tls = None if access.tls_cert is None else _tls(access)
-    listening = bind(address, port)
-    try:
+    with ExitStack() as closing:
+        listening = bind(address, port)
+        closing.callback(listening.close)
         given = None if world is None else _geometry(world)
         gate = _gate(access, listening.getsockname()[1])
         finder = _finder(names, network)
-        try:
-            _check_names(names, finder)
-            announcer = Announcer(gate.pairing if isinstance(gate, TokenGate) else None, loopback)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop, given, metrics)
-        finally:
-            finder.close()
-    finally:
-        listening.close()
+        closing.callback(finder.close)
+        _check_names(names, finder)
+        pairing = gate.pairing if isinstance(gate, TokenGate) else None
+        ready = on_ready or Announcer(pairing, loopback)
+
+        from skyloop.cockpit.app import create_app
+        from skyloop.cockpit.fleet import Fleet
+        from skyloop.cockpit.recordings import Recordings
+        from skyloop.cockpit.target_tracker import warm_up
+
+        address, port = listening.getsockname()[:2]
+        own_name = () if bind_address(address)[1] else host_names()
+        hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
+        admission = Admission(places_here())
+        fleet = Fleet(finder, kept=names)
+        authority = None if access.page_authority is None else access.page_authority.read_bytes()
+        kept = Recordings(recordings)
+        app = create_app(fleet, kept, hosts, gate, admission=admission, world=given, page_authority=authority)
+        server = quiet_server(app)
+        seen_at = reachable(address)[0]
+        page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
+        listener = Listener(listening, admission, http_protocol(server, admission), tls)
+        if metrics is not None:
+            from skyloop.metrics import serve
+
+            endpoint = closing.enter_context(serve(lambda: fleet_sources(fleet), metrics))
+            print(endpoint.announcement, file=sys.stderr, flush=True)
+        expire_codes = pairing.expire if pairing is not None else lambda: None
+        threading.Thread(target=warm_up, name="skyloop-warm-up").start()
+        asyncio.run(_run(server, listener, lambda: ready(page), stop, expire_codes))
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
@@ -231,7 +252,7 @@ def _session_file(cookie: str) -> SessionFile | None:
     """Return the file where sessions outlive this process; None if no folder belongs to this user alone."""
     if sys.platform != "linux":
         return None
-    from skyloop.cockpit.sessions import SessionFile
+    from skyloop.cockpit.access import SessionFile
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()
@@ -241,11 +262,7 @@ def _session_file(cookie: str) -> SessionFile | None:
 
 
 def _tls(access: Access) -> ssl.SSLContext:
-    """Create the server's TLS context.
-
-    Raises:
-        UsageError: A file is invalid.
-    """
+    """Create the server's TLS context. Raise ``UsageError`` if a file is invalid."""
     assert access.tls_cert is not None
     for file in filter(None, (access.tls_cert, access.tls_key)):
         if not file.exists():
@@ -264,59 +281,8 @@ def _tls(access: Access) -> ssl.SSLContext:
     return context
 
 
-def _serve(
-    finder: Finder,
-    names: Sequence[str],
-    access: Access,
-    gate: Gate,
-    tls: ssl.SSLContext | None,
-    recordings: Path,
-    listening: socket.socket,
-    on_ready: Callable[[str], None],
-    stop: threading.Event | None,
-    world: WorldGeometry | None,
-    metrics: str | None,
-) -> None:
-    from skyloop.cockpit.access import TokenGate
-    from skyloop.cockpit.app import create_app
-    from skyloop.cockpit.fleet import Fleet
-    from skyloop.cockpit.recordings import Recordings
-    from skyloop.cockpit.security import bind_address, own_names
-    from skyloop.cockpit.target_tracker import warm_up
-
-    address, port = listening.getsockname()[:2]
-    own_name = () if bind_address(address)[1] else host_names()
-    hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
-    admission = Admission(places_here())
-    fleet = Fleet(finder, kept=names)
-    authority = None if access.page_authority is None else access.page_authority.read_bytes()
-    app = create_app(
-        fleet, Recordings(recordings), hosts, gate, admission=admission, world=world, page_authority=authority
-    )
-    server = quiet_server(app)
-    seen_at = reachable(address)[0]
-    page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
-    listener = Listener(listening, admission, http_protocol(server, admission), tls)
-    with ExitStack() as beside:
-        if metrics is not None:
-            from skyloop.metrics import serve
-
-            endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
-            print(endpoint.announcement, file=sys.stderr, flush=True)
-        pairing = gate.pairing if isinstance(gate, TokenGate) else None
-        expire_codes = _idle if pairing is None else pairing.expire
-        threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, expire_codes))
-
-
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
-    """Return a factory for the HTTP protocol of connections to a server that has started.
-
-    Args:
-        server: The server.
-        admission: Informed about the progress of each connection.
-        clock: The monotonic clock [ns].
-    """
+    """Return a factory for the HTTP protocol of connections to a server that has started."""
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     from skyloop.cockpit.access import CERTIFICATE
@@ -379,10 +345,6 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
         timeout_graceful_shutdown=2,
     )
     return QuietServer(config)
-
-
-def _idle() -> None:
-    pass
 
 
 async def _run(

@@ -18,8 +18,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.encoded_feed import FPS, SmallFeed, pack, rounded_width
 from skyloop.cockpit.feeds import Wake
-from skyloop.cockpit.page_stream import PageStream
-from skyloop.cockpit.stream import encoding_values, picture_values
+from skyloop.cockpit.stream import PageStream, encoding_values, picture_values
 from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ class _Shown:
         if station is None:
             return
         if self.h264 and self.stream is None:
-            info = next((info for info in station.drone.capabilities.cameras if info.name == camera), None)
+            info = station.camera_info(camera)
             if info is not None:
                 self.stream = PageStream(station, info, self.width, FPS, wake)
         if self.stream is not None and self.stream.shows:

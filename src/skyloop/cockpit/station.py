@@ -7,7 +7,7 @@ import logging
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.actions import OUTDONE, OVERRULED
@@ -15,16 +15,17 @@ from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import ThresholdReader
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, SmallFeed
-from skyloop.cockpit.feeds import ROW_HZ, Cancellable, EventFeed, LogFeed, PeriodicBroadcast
+from skyloop.cockpit.feeds import ROW_HZ, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.control.waypoint import Waypoint
 from skyloop.errors import LinkError, NoAnswerError, RefusedError, SkyloopError
 from skyloop.extend import Known, commands, let_go, open_unasked
-from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Outcome
+from skyloop.messages import AnyAction, CameraInfo, EventKind, FlightState, Idle, LinkState, Outcome
 from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
+    from skyloop.client import Listener
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
@@ -47,16 +48,7 @@ class PilotConnection(Drone):
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
-        """Connect without requesting the authority.
-
-        Args:
-            dial: Opens a new connection to the proxy on each call.
-            app: The name to connect under.
-            timeout_s: Time for the proxy to answer [s].
-
-        Raises:
-            SkyloopError: The connection can't be opened.
-        """
+        """Connect without requesting the authority. ``dial``: opens a new connection to the proxy on each call."""
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
@@ -80,27 +72,15 @@ class PilotConnection(Drone):
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
         """Request the authority now.
 
-        Args:
-            priority: 0 is the highest, 31 the lowest.
-            ask: Ask the holder first, and wait in the queue instead of failing.
-
-        Raises:
-            AuthorityError: Another application holds the authority; the message names it.
+        ``priority``: 0 is the highest, 31 the lowest. ``ask``: ask the holder first, and wait in the queue instead of
+        failing. Raise ``AuthorityError`` if another application holds the authority; the message names it.
         """
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
         """Answer a request for the authority and wait until the proxy has received the answer.
 
-        Args:
-            lease: The lease by which this connection holds the authority.
-            app_id: The application that asked.
-            grant: Whether to hand the authority over.
-            reason: The reason for a refusal, shown to the person who asked.
-
-        Raises:
-            RefusedError: This connection no longer holds the authority.
-            LinkError: The proxy does not answer.
+        Raise ``RefusedError`` if this connection no longer holds the authority.
         """
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
@@ -172,9 +152,7 @@ class FlyingSession(Protocol):
 class Station:
     """One drone and the state that its pages share. Created and closed on the event loop.
 
-    Args:
-        found: The address of the proxy.
-        drone: The drone, connected as an observer; closed by :meth:`close`.
+    ``drone``: the drone, connected as an observer; closed by :meth:`close`.
     """
 
     def __init__(self, found: Found, drone: Drone) -> None:
@@ -193,7 +171,7 @@ class Station:
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
         drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # registered until the drone is closed
-        self._whole: Cancellable | None = None  # consumes all feedback while a page shows the drone
+        self._whole: Listener[Any] | None = None  # consumes all feedback while a page shows the drone
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
         self._stops = 0  # number of emergency stops in progress
@@ -215,15 +193,19 @@ class Station:
         """The feeds of all cameras, in all sizes and forms."""
         return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
+    def camera_info(self, name: str) -> CameraInfo | None:
+        """Return a camera's description, or None if the vehicle has no such camera."""
+        return next((info for info in self.drone.capabilities.cameras if info.name == name), None)
+
     def camera(self, name: str) -> CameraFeed | None:
         """Return a camera's feed, or None if the vehicle has no such camera."""
-        if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
+        if name not in self.cameras and self.camera_info(name) is not None:
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
 
     def small_video(self, name: str, width: int) -> SmallFeed | None:
         """Return a camera's feed scaled down to a width [pixels], or None if the vehicle has no such camera."""
-        camera = next((info for info in self.drone.capabilities.cameras if info.name == name), None)
+        camera = self.camera_info(name)
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
@@ -252,16 +234,14 @@ class Station:
     def feedback(self) -> Feedback:
         """Return the newest feedback, which arrives at a low rate while pages show only the drone's row.
 
-        Raises:
-            LinkError: There is no feedback, or the drone was closed.
+        Raise ``LinkError`` if there is no feedback, or the drone was closed.
         """
         return self.drone.feedback(max_hz=ROW_HZ)
 
     def fresh_feedback(self) -> Feedback:
         """Wait for a state captured from now on, because the newest feedback may predate a take-off.
 
-        Raises:
-            LinkError: No feedback arrives within :data:`FRESH_S`.
+        Raise ``LinkError`` if no feedback arrives within :data:`FRESH_S`.
         """
         now_ns = self.drone.now_ns
         return self.drone.wait(lambda feedback: feedback.captured_ns >= now_ns, FRESH_S)
@@ -285,11 +265,7 @@ class Station:
     async def open_pilot(self, app: str) -> PilotConnection:
         """Open a pilot's connection that does not hold the authority yet.
 
-        Args:
-            app: The name to connect under.
-
-        Raises:
-            SkyloopError: The connection can't be opened within :data:`PILOT_S`.
+        Raise ``SkyloopError`` if the connection can't be opened within :data:`PILOT_S`.
         """
 
         def connect() -> PilotConnection:
@@ -319,11 +295,7 @@ class Station:
             await self._end(stopper)
 
     async def stopper(self) -> PilotConnection:
-        """Return the pilot's connection for emergency stops, which never holds the authority.
-
-        Raises:
-            SkyloopError: The connection can't be opened.
-        """
+        """Return the pilot's connection for emergency stops, which never holds the authority."""
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
         return await asyncio.shield(self._stopper)

@@ -125,8 +125,7 @@ class QueueTracker:
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the page's position in the queue.
 
-        Returns:
-            None if the page does not wait. Otherwise equal to the previous result until the status changes.
+        Return None if the page does not wait, otherwise a value equal to the previous one until the status changes.
         """
         if status.state == "held":  # a pilot that was overruled later gets the authority back without asking
             self.request(ask=False)
@@ -141,11 +140,7 @@ class QueueTracker:
 
 
 class TakeoverDialog:
-    """Handles both sides of a takeover for one page. On the event loop.
-
-    Args:
-        send: Sends a message to the page.
-    """
+    """Handles both sides of a takeover for one page. On the event loop."""
 
     def __init__(self, send: Callable[[Json], None]) -> None:
         self._send = send
@@ -170,12 +165,7 @@ class TakeoverDialog:
         return None if pilot is None else self._queue.update(pilot.authority, monotonic_ns())
 
     async def answer(self, command: Answer, pilot: PilotConnection) -> None:
-        """Send the page's answer to the proxy.
-
-        Raises:
-            RefusedError: The question is no longer open.
-            LinkError: The proxy does not answer.
-        """
+        """Send the page's answer to the proxy. Raise ``RefusedError`` if the question is no longer open."""
         question = self._questions.find(command.id)
         if question is None:
             raise RefusedError("the request for control is no longer open")
@@ -191,10 +181,7 @@ GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later los
 class AuthorityReport:
     """Compares the authority with the last message to the page. On the event loop.
 
-    Args:
-        station: The drone.
-        app: The name under which the page flies.
-        gone_s: The page's control expires after this long without a sign of life from the cockpit [s].
+    ``gone_s``: the page's control expires after this long without a sign of life from the cockpit [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:
@@ -219,9 +206,7 @@ class AuthorityReport:
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
         """Return the message for the page, or None if nothing has changed.
 
-        Args:
-            pilot: The page's own connection, if any.
-            place: The page's position in the queue while it waits.
+        ``pilot``: the page's own connection, if any. ``place``: the page's position in the queue while it waits.
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state

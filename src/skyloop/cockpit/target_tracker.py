@@ -67,15 +67,13 @@ class KeptFrames:
             self.bytes -= self._frames.popleft().header.size
 
     def clear(self) -> None:
-        """Discard all frames."""
         self._frames.clear()
         self.bytes = 0
 
     def find(self, captured_ns: int) -> Arrival:
         """Return the frame with this capture time.
 
-        Raises:
-            RefusedError: The frame was not kept; the message says why.
+        Raise ``RefusedError`` if the frame was not kept; the message says why.
         """
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
@@ -96,9 +94,7 @@ class KeptFrames:
         """Return the next frame to track while catching up, or None if none is newer.
 
         This is the newest one within :data:`STRIDE_S` after the last or, if there is none, the first one after it.
-
-        Args:
-            captured_ns: Capture time of the last frame tracked.
+        ``captured_ns``: capture time of the last frame tracked.
         """
         best = None
         for arrival in self._frames:
@@ -119,10 +115,8 @@ _RESULTS: Final = 16  # results of processors kept
 class FrameKeeper:
     """Keeps one camera's frames, with feedback and detections, until :meth:`close`.
 
-    Args:
-        drone: Provides the frames; may be connected as an observer.
-        camera: The camera's name.
-        first: Called once with the capture time of the first frame kept [ns], on the listener's thread.
+    ``drone``: provides the frames; may be connected as an observer. ``first``: called once with the capture time of the
+    first frame kept [ns], on the listener's thread.
     """
 
     def __init__(self, drone: Drone, camera: str, first: Callable[[int], None] = lambda _: None) -> None:
@@ -243,39 +237,23 @@ class Follower(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TrackReport:
-    """The result of one step.
+    """The result of one step."""
 
-    Attributes:
-        status: The follower's status; None before its first frame.
-        caught_up: Whether it has tracked up to the newest frame.
-        action: The current set-point; None if none is wanted, and while catching up.
-        over: Whether the follower has given up.
-        size: Width and height of the frames [px].
-        frame_ns: When the last frame was tracked, on this process's clock.
-        frame_age_s: Age of that frame at that time [s].
-        problem: An error in the follower, which is not called again; empty if there is none.
-    """
-
-    status: FollowStatus | None
-    caught_up: bool
-    action: AnyAction | None
-    over: bool
-    size: tuple[int, int]
-    frame_ns: int
-    frame_age_s: float
-    problem: str = ""
+    status: FollowStatus | None  #: the follower's status; None before its first frame
+    caught_up: bool  #: whether it has tracked up to the newest frame
+    action: AnyAction | None  #: the current set-point; None if none is wanted, and while catching up
+    over: bool  #: whether the follower has given up
+    size: tuple[int, int]  #: width and height of the frames [px]
+    frame_ns: int  #: when the last frame was tracked, on this process's clock
+    frame_age_s: float  #: age of that frame at that time [s]
+    problem: str = ""  #: an error in the follower, which is not called again; empty if there is none
 
 
 class TargetTracker:
     """Calls a follower with frames and feedback on a separate thread and reports each step.
 
-    Args:
-        drone: Publishes the drawings; may be connected as an observer.
-        keeper: Keeps the frames; closed with this object.
-        begin: The frame under the box.
-        make: Creates the follower; called on the thread.
-        report: Called after each step, on the thread.
-        clock: This process's monotonic clock [ns].
+    ``drone``: publishes the drawings; may be connected as an observer. ``keeper``: keeps the frames; closed with this
+    object. ``make``: creates the follower; called on the thread. ``report``: called after each step, on the thread.
     """
 
     def __init__(
@@ -305,7 +283,6 @@ class TargetTracker:
         self._thread = threading.Thread(target=self._run, name="skyloop-follow", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def close(self) -> None:

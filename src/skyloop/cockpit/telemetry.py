@@ -115,11 +115,6 @@ def flat_values(
     """Return every number under a unique name, for use in plots.
 
     Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. Unknown numbers are omitted.
-
-    Args:
-        feedback: The newest feedback, or None.
-        logged: The newest number in each series.
-        set_point: The command applied, or None.
     """
     found: dict[str, float | None] = {}
     if feedback is not None:
@@ -148,8 +143,7 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
     """Convert a motion capture pose to JSON values.
 
-    Args:
-        pose: Position [m] and quaternion x, y, z, w; None if unknown.
+    ``pose``: position [m] and quaternion x, y, z, w; None if unknown.
     """
     if pose is None:
         return None
@@ -172,13 +166,7 @@ def target_values(native: Mapping[str, Value] | None) -> list[Json]:
 
 
 def event_values(number_: int, event: Event, now_ns: int) -> Json:
-    """Convert an event to JSON values.
-
-    Args:
-        number_: The number that the cockpit assigned to it.
-        event: The event.
-        now_ns: The current time on the proxy's clock.
-    """
+    """Convert an event to JSON values. ``now_ns``: the current time on the proxy's clock."""
     return {
         "n": number_,
         "kind": str(event.kind),
@@ -227,12 +215,7 @@ def _fields(action: AnyAction) -> Iterator[tuple[str, float]]:
 
 
 class TelemetryView:
-    """One drone as seen by pages. Used on the event loop.
-
-    Args:
-        station: The drone.
-        clock: The monotonic clock [ns].
-    """
+    """One drone as seen by pages. Used on the event loop."""
 
     def __init__(self, station: Station, clock: Clock = monotonic_ns) -> None:
         self._station = station

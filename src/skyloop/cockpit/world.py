@@ -20,7 +20,7 @@ from skyloop.client import Level, PreflightFinding
 from skyloop.cockpit.api import BadRequest, answer_json, answered
 from skyloop.cockpit.feeds import ROW_HZ
 from skyloop.cockpit.telemetry import Json, number, vector
-from skyloop.errors import NoAnswerError, ParameterError, UnknownNameError
+from skyloop.errors import NoAnswerError, ParameterError
 from skyloop.messages import Position
 from skyloop.messages.parameter import WORLD, WorldGeometry, decode_world
 from skyloop.proxy.core.airspace import Airspace
@@ -41,12 +41,7 @@ RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
     """Return a drone's surroundings for maps. This queries its proxy and waits for the answers.
 
-    Args:
-        drone: The drone.
-        given: The scenery for a drone that does not report any.
-
-    Raises:
-        LinkError: The proxy does not answer.
+    ``given``: the scenery for a drone that does not report any.
     """
     read = _reader(drone)
     known = _known(read(WORLD))
@@ -65,12 +60,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
     """Return the proxy's objections to flying straight to a place from the drone's position.
 
-    Args:
-        drone: The drone.
-        place: The place, in world axes [m].
-
-    Raises:
-        LinkError: The proxy does not answer.
+    ``place``: the place, in world axes [m].
     """
     read = _reader(drone)
 
@@ -185,10 +175,7 @@ MAX_ASKING: Final = 4  #: simultaneous requests to drones; each may block its th
 class WorldApi:
     """The routes ``world``, ``way`` and ``preflight`` of each drone.
 
-    Args:
-        fleet: The drones.
-        recordings: The recordings of the same drones.
-        given: The surroundings of drones that don't report any.
+    ``given``: the surroundings of drones that don't report any.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
@@ -198,7 +185,6 @@ class WorldApi:
         self._asking = asyncio.Semaphore(MAX_ASKING)
 
     def routes(self) -> list[Route]:
-        """Return the routes."""
         return [
             Route("/api/drones/{name}/world", self.world),
             Route("/api/drones/{name}/way", self.way),
@@ -231,11 +217,9 @@ class WorldApi:
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
         """Query a drone on a thread, because its answer may take a while."""
-        name, stations = request.path_params["name"], self._fleet.stations
-        if name not in stations:
-            raise UnknownNameError("drone", name, stations)
+        drone = self._fleet.station(request.path_params["name"]).drone
         async with self._asking:
-            return answer_json(await asyncio.to_thread(question, stations[name].drone))
+            return answer_json(await asyncio.to_thread(question, drone))
 
 
 def _place(text: str) -> tuple[float, float, float]:

@@ -39,15 +39,11 @@ Counts = Counter[tuple[int, str]]
 
 
 class Backlog:
-    """A bounded first-in, first-out queue with any number of producers and one consumer.
-
-    Attributes:
-        dropped: Counts of dropped items.
-    """
+    """A bounded first-in, first-out queue with any number of producers and one consumer."""
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
         """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` bytes more."""
-        self.dropped: Counts = Counter()
+        self.dropped: Counts = Counter()  #: counts of dropped items
         self._limit = limit
         self._ceiling = limit + reserve
         self._lock = threading.Lock()

@@ -53,8 +53,6 @@ LINE_WIDTH: Final = 2.0  # pixels
 FONT_SIZE: Final = 14.0
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 
-Vector = tuple[float, float, float]
-
 
 def schema(message: type[Message]) -> bytes:
     """Return the file descriptor set of a message with all its dependencies, as MCAP requires."""

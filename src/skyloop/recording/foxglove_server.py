@@ -1,41 +1,48 @@
 """A WebSocket server for Foxglove: live topics with the same schemas as recordings, and the drones' parameters.
 
 The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends on its own threads and
-drops the oldest messages for a viewer that does not read.
+drops the oldest messages for a viewer that does not read. Any viewer can read parameters; writing one briefly acquires
+a lease.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
+import random
+import re
+import socket
+import socketserver
+import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from skyloop.address import is_loopback
-from skyloop.client import Drone
-from skyloop.errors import LinkError, MissingExtraError, SkyloopError, UsageError
+from skyloop.client import Authority, Drone, connect
+from skyloop.client.channels import Listener
+from skyloop.errors import LinkError, MissingExtraError, ParameterError, SkyloopError, UnknownNameError, UsageError
 from skyloop.extend import Known
-from skyloop.messages import CameraInfo, Capabilities, Value
+from skyloop.messages import CameraInfo, Capabilities, Event, Parameter, ParameterType, Value
 from skyloop.messages.frame import H264, Chain
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
-from skyloop.recording.foxglove_access import OriginGuard, ParameterAccess, Written, hidden_host
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, Topic
 from skyloop.recording.options import VIDEO
-from skyloop.recording.output import Message, Schema
-from skyloop.recording.taps import check_names
-from skyloop.recording.translation import Picture, Translator
-from skyloop.recording.view import Source
+from skyloop.recording.taps import Parameters, Source, check_names
+from skyloop.recording.translation import Message, Picture, Schema, Translator
 
 PORT: Final = 8765  #: Foxglove's default
 WAITING: Final = 512  #: messages queued per viewer before its oldest are dropped
 
 
 class FoxgloveServer:
-    """A :class:`skyloop.recording.view.Screen` that serves any number of viewers."""
+    """A :class:`skyloop.recording.taps.Screen` that serves any number of viewers."""
 
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
@@ -89,7 +96,7 @@ class FoxgloveServer:
                 host=host if self._guard is None else hidden,
                 port=port if self._guard is None else 0,
                 capabilities=[self._sdk.Capability.Parameters],
-                server_listener=_Listener(self),
+                server_listener=self,
                 context=self._context,
                 message_backlog_size=WAITING,
             )
@@ -182,53 +189,57 @@ class FoxgloveServer:
             topic.name, schema=described, message_encoding=schema.message_encoding, context=self._context
         )
 
-    # On the viewers' threads -----------------------------------------------------------------------------------
+    # On the SDK's threads, as it calls its listener; it only logs exceptions raised here ------------------------------
 
-    def subscribed(self, topic: str) -> None:
+    def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
         """Register a viewer's subscription."""
         with self._lock:
-            self._viewers[topic] += 1
-            self._began.add(topic)
-            if self._viewers[topic] == 1:
-                self._starts.add(topic)
+            self._viewers[channel.topic] += 1
+            self._began.add(channel.topic)
+            if self._viewers[channel.topic] == 1:
+                self._starts.add(channel.topic)
 
-    def unsubscribed(self, topic: str) -> None:
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
         """Remove the subscription of a viewer that unsubscribed or disconnected."""
         with self._lock:
-            self._viewers[topic] -= 1
+            self._viewers[channel.topic] -= 1
 
-    def read_parameters(self, names: Sequence[str]) -> list[Any]:
+    def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
         """Return the named parameters, or all."""
         self._ready.wait()
         self._parameters.follow()
         try:
-            found = self._parameters.read(names)
+            found = self._parameters.read(param_names)
         except SkyloopError as error:
             self._report(f"the parameters can't be read: {error.reason}", "parameters")
             return []
         return [self._parameter(name, value) for name, value in found.items()]
 
-    def write_parameters(self, wanted: Sequence[Any]) -> list[Any]:
+    def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
         """Write parameters and return the values they have afterwards."""
         self._ready.wait()
         found = []
-        for each in wanted:
+        for each in parameters:
             written = self._parameters.write(each.name, each.get_value())
-            self._report_written(written)
+            if written.refused:
+                self._report(written.refused, written.name)
+            else:
+                self._server.remove_status([written.name])
             if written.value is not None:
                 found.append(self._parameter(written.name, written.value))
         return found
 
-    def follow_parameters(self) -> None:
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:  # noqa: ARG002
         """Report parameter changes from now on."""
         self._ready.wait()
         self._parameters.follow()
 
-    def _report_written(self, written: Written) -> None:
-        if written.refused:
-            self._report(written.refused, written.name)
-        else:
-            self._server.remove_status([written.name])
+    def on_parameters_unsubscribe(self, param_names: list[str]) -> None: ...
+    def on_client_advertise(self, client: Any, channel: Any) -> None: ...
+    def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None: ...
+    def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None: ...
+    def on_connection_graph_subscribe(self) -> None: ...
+    def on_connection_graph_unsubscribe(self) -> None: ...
 
     def _report(self, text: str, about: str) -> None:
         self._server.publish_status(text, self._sdk.StatusLevel.Warning, about)
@@ -238,35 +249,6 @@ class FoxgloveServer:
 
     def _parameter(self, name: str, value: Value) -> Any:
         return self._sdk.Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-
-
-class _Listener:
-    """The SDK's callbacks, which it calls on its own threads. It only logs exceptions that they raise."""
-
-    def __init__(self, server: FoxgloveServer) -> None:
-        self._server = server
-
-    def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
-        self._server.subscribed(channel.topic)
-
-    def on_unsubscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
-        self._server.unsubscribed(channel.topic)
-
-    def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
-        return self._server.read_parameters(param_names)
-
-    def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
-        return self._server.write_parameters(parameters)
-
-    def on_parameters_subscribe(self, param_names: list[str]) -> None:  # noqa: ARG002
-        self._server.follow_parameters()
-
-    def on_parameters_unsubscribe(self, param_names: list[str]) -> None: ...
-    def on_client_advertise(self, client: Any, channel: Any) -> None: ...
-    def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None: ...
-    def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None: ...
-    def on_connection_graph_subscribe(self) -> None: ...
-    def on_connection_graph_unsubscribe(self) -> None: ...
 
 
 def _sdk() -> Any:
@@ -288,14 +270,9 @@ class ViewTopic:
     """A topic that viewers can subscribe to."""
 
     name: str
-    kind: type[Any]  #: class of the topic's messages, see :class:`skyloop.recording.output.Message`
+    kind: type[Any]  #: class of the topic's messages, see :class:`skyloop.recording.translation.Message`
     channels: tuple[str, ...]  #: the drone's channels that the topic needs; empty for state known in advance
     at_once: bool = True  #: whether the topic is announced before its first message
-
-    @property
-    def shared(self) -> bool:
-        """Whether all drones share the topic."""
-        return self.name in (layout.TF, layout.LOG)
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
@@ -324,3 +301,216 @@ def _of_camera(drone: str, camera: CameraInfo, far: bool) -> Iterator[ViewTopic]
     yield ViewTopic(calibration, foxglove.CameraCalibration, () if known else frames)
     drawings = layout.drawing_topic(drone, camera.name)
     yield ViewTopic(drawings, foxglove.ImageAnnotations, (Channel.ANNOTATIONS.value,))
+
+
+# Access: which web pages may connect, and how viewers read and write parameters ----------------------------------
+
+
+LOOKS_ONLY: Final = "this view is read-only: start it with --write to write parameters"
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The result of writing a parameter."""
+
+    name: str  #: parameter name, prefixed with the drone's name
+    value: Value | None  #: the current value; None if it could not be read
+    refused: str = ""  #: why the write was refused; empty if it succeeded
+
+
+class ParameterAccess:
+    """Reads and writes parameters by names such as ``alpha/limits.tilt``. Safe to use from any thread."""
+
+    def __init__(
+        self,
+        drones: Sequence[Drone],
+        priority: int | None,
+        on_change: Callable[[str, Value], None] = lambda *_: None,
+    ) -> None:
+        """Initialise without sending any request.
+
+        Args:
+            drones: Observed drones, with distinct names.
+            priority: Priority used for writes, 0 (the highest) to 31; None forbids writing.
+            on_change: Called with a parameter's name and value on a separate thread: once for each parameter when
+                :meth:`follow` is called, then after each change.
+        """
+        self._drones = {drone.name: drone for drone in drones}
+        self._priority = priority
+        self._on_change = on_change
+        self._lock = threading.Lock()  # serialises writes and starting to follow
+        self._following: list[tuple[Parameters, Listener[Event]]] = []
+
+    def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
+        """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not answer.
+
+        Raise ``SkyloopError`` if a drone does not answer.
+        """
+        wanted = set(names)
+        of = {name.partition("/")[0] for name in wanted} if wanted else self._drones.keys()
+        found = {
+            f"{drone.name}/{parameter.name}": parameter.value
+            for name, drone in self._drones.items()
+            if name in of
+            for parameter in drone.config.parameters()
+        }
+        return {name: value for name, value in found.items() if not wanted or name in wanted}
+
+    def write(self, name: str, value: object) -> Written:
+        """Write a parameter and return the value it has afterwards."""
+        refused = ""
+        with self._lock:
+            try:
+                self._write(name, value)
+            except SkyloopError as error:
+                refused = f"{name} was not written: {error.reason}"
+            return Written(name, self._present(name), refused)
+
+    def follow(self) -> None:
+        """Report every parameter, then every change. Idempotent."""
+        with self._lock:
+            if self._following:
+                return
+            for drone in self._drones.values():
+                followed = Parameters(drone, self._reporter(drone.name))
+                self._following.append((followed, drone.on_event(followed.event, inline=True)))
+                followed.start()
+
+    def close(self) -> None:
+        """Stop reporting changes."""
+        for followed, listener in self._following:
+            listener.cancel()
+            followed.stop()
+
+    def _reporter(self, drone: str) -> Callable[[Parameter], None]:
+        return lambda parameter: self._on_change(f"{drone}/{parameter.name}", parameter.value)
+
+    def _write(self, name: str, value: object) -> None:
+        drone, key = self._found(name)
+        parameter = drone.config.describe(key)
+        if self._priority is None:
+            raise ParameterError(LOOKS_ONLY)
+        authority = Authority(priority=self._priority)
+        with connect(drone.name, authority=authority, name="skyloop view", on_exit="hover") as writer:
+            writer.config[key] = _typed(parameter, value)
+
+    def _present(self, name: str) -> Value | None:
+        try:
+            drone, key = self._found(name)
+            return drone.config[key]
+        except SkyloopError:
+            return None
+
+    def _found(self, name: str) -> tuple[Drone, str]:
+        drone, _, key = name.partition("/")
+        if drone not in self._drones:
+            raise UnknownNameError("drone in this view", drone, self._drones)
+        return self._drones[drone], key
+
+
+def _typed(parameter: Parameter, value: object) -> object:
+    """Convert a viewer's value to the parameter's type: viewers send 1 for 1.0."""
+    if parameter.type is ParameterType.FLOAT and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if parameter.type is ParameterType.INT and isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+# Origins --------------------------------------------------------------------------------------------------------
+
+
+MAX_HEAD: Final = 16_384  #: maximum size of a request's head [bytes]
+HEAD_S: Final = 5.0  #: time limit for receiving a request's head
+_CHUNK: Final = 1 << 16
+_ORIGIN: Final = re.compile(rb"^origin[ \t]*:[ \t]*(.*?)[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
+_FOXGLOVE: Final = "foxglove.dev"
+_REFUSED: Final = (
+    b"HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
+    b"pages of other origins can't connect while parameters are writable\n"
+)
+
+
+def is_trusted(origin: str) -> bool:
+    """Return whether a page may connect: Foxglove's web page or desktop application, or a local page."""
+    parts = urlsplit(origin)
+    name = parts.hostname or ""
+    if parts.scheme == "https" and (name == _FOXGLOVE or name.endswith(f".{_FOXGLOVE}")):
+        return True
+    if parts.scheme in ("http", "https"):
+        return is_loopback(name)
+    return parts.scheme == "file"  # Foxglove's desktop application; the origin "null" could be any page
+
+
+def hidden_host() -> str:
+    """Return a random loopback address, which a page can't find by scanning ports."""
+    if sys.platform != "linux":
+        return "127.0.0.1"
+    return str(ipaddress.IPv4Address((127 << 24) + random.SystemRandom().randrange(1 << 16, 1 << 24)))
+
+
+class OriginGuard:
+    """Listens until :meth:`close` and forwards connections from trusted origins to the server.
+
+    ``port``: port to listen on; 0 picks a free one. Raise ``OSError`` if listening on the address failed.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        guard = self
+
+        class Visitor(socketserver.BaseRequestHandler):
+            def handle(self) -> None:
+                guard._accept(self.request)
+
+        class Server(socketserver.ThreadingTCPServer):
+            address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            allow_reuse_address = True
+            daemon_threads = True
+            block_on_close = False
+
+            def handle_error(self, request: Any, client_address: Any) -> None: ...
+
+        #: address and port of the server behind it; set before the port is announced
+        self.behind: tuple[str, int] = ("", 0)
+        self._server = Server((host, port), Visitor)
+        self.port = int(self._server.server_address[1])  #: the port it listens on
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop accepting connections. Existing ones end when the server does."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def _accept(self, visitor: socket.socket) -> None:
+        visitor.settimeout(HEAD_S)
+        head = b""
+        while b"\r\n\r\n" not in head and len(head) < MAX_HEAD:
+            if not (more := visitor.recv(_CHUNK)):
+                return
+            head += more
+        origins = _ORIGIN.findall(head.partition(b"\r\n\r\n")[0])
+        if len(head) >= MAX_HEAD or not all(is_trusted(origin.decode("latin-1")) for origin in origins):
+            visitor.sendall(_REFUSED)
+            return
+        visitor.settimeout(None)
+        with socket.create_connection(self.behind, timeout=HEAD_S) as server:
+            server.settimeout(None)
+            server.sendall(head)
+            back = threading.Thread(target=_pump, args=(server, visitor), name="skyloop-foxglove-guard", daemon=True)
+            back.start()
+            _pump(visitor, server)
+            back.join()
+
+
+def _pump(source: socket.socket, target: socket.socket) -> None:
+    """Copy bytes until either socket closes, then shut down both."""
+    with contextlib.suppress(OSError):
+        while data := source.recv(_CHUNK):
+            target.sendall(data)
+    for one in (source, target):
+        with contextlib.suppress(OSError):
+            one.shutdown(socket.SHUT_RDWR)

@@ -30,35 +30,7 @@ from skyloop.messages import (
 )
 from skyloop.recording.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 
-__all__ = [
-    "Channel",
-    "ClockPair",
-    "DroneRecord",
-    "Drops",
-    "End",
-    "FrameRecord",
-    "ResultRecord",
-    "Start",
-    "TYPES",
-    "Topic",
-    "calibration_topic",
-    "decode",
-    "drawing_topic",
-    "encode",
-    "from_metadata",
-    "from_plain",
-    "image_topic",
-    "optical_frame",
-    "parse_topic",
-    "path_topic",
-    "mocap_topic",
-    "pose_topic",
-    "schema",
-    "schema_name",
-    "to_metadata",
-    "to_plain",
-    "video_topic",
-]
+__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # from plain, for other modules
 
 T = TypeVar("T")
 
@@ -128,11 +100,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
     @property
     def described(self) -> Capabilities:
-        """Decode the drone's capabilities.
-
-        Raises:
-            FileFormatError: They can't be decoded.
-        """
+        """Decode the drone's capabilities. Raise ``FileFormatError`` if they can't be decoded."""
         return from_plain(self.capabilities, Capabilities)
 
 
@@ -166,11 +134,7 @@ def to_metadata(record: msgspec.Struct) -> dict[str, str]:
 
 
 def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
-    """Convert strings back to a metadata record.
-
-    Raises:
-        FileFormatError: The strings do not match the record.
-    """
+    """Convert strings back to a metadata record. Raise ``FileFormatError`` if the strings do not match the record."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     try:
@@ -260,7 +224,6 @@ class Topic:
     camera: str = ""
 
     def __str__(self) -> str:
-        """Return the topic as a string."""
         return "/" + "/".join(map(_quoted, (self.drone, self.channel.value, *([self.camera] if self.camera else []))))
 
 

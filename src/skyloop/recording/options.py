@@ -25,11 +25,7 @@ CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, 
 
 
 class Options(msgspec.Struct, frozen=True):
-    """Recording options; :func:`skyloop.record` describes each.
-
-    Raises:
-        UsageError: A value is out of range.
-    """
+    """Recording options; :func:`skyloop.record` describes each. Raise ``UsageError`` if a value is out of range."""
 
     channels: tuple[str, ...] = CHOICES
     encoding: VideoEncoding = "auto"
@@ -71,11 +67,7 @@ class Options(msgspec.Struct, frozen=True):
         return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
-        """Check that the chosen cameras exist.
-
-        Raises:
-            UnknownNameError: No drone has a camera of that name.
-        """
+        """Check that the chosen cameras exist. Raise ``UnknownNameError`` if no drone has a camera of that name."""
         cameras = set(known)
         for name in self.channels:
             kind, dot, camera = name.partition(".")
@@ -86,12 +78,8 @@ class Options(msgspec.Struct, frozen=True):
 def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
     """Convert the caller's choice of channels to names from :data:`CHOICES`.
 
-    Args:
-        names: One name or several; ``command`` means ``commands``. None selects all.
-
-    Raises:
-        UnknownNameError: A channel does not exist.
-        UsageError: No channel was given.
+    ``names``: one name or several; ``command`` means ``commands``. None selects all. Raise ``UnknownNameError`` if a
+    channel does not exist, or ``UsageError`` if no channel was given.
     """
     if names is None:
         return CHOICES
@@ -119,8 +107,7 @@ def numbered(path: Path, number: int) -> Path:
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
     """Return the path to record to: the file (``.mcap`` by default), or in a folder, one named by drones and time.
 
-    Raises:
-        UsageError: The file already exists, or its folder does not.
+    Raise ``UsageError`` if the file already exists, or its folder does not.
     """
     if path.is_dir():
         path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"

@@ -184,7 +184,7 @@ class Group:
             MissingExtraError: PyAV is not installed.
         """
         if self._context is None or index < self._done - 1:
-            self._context, self._done = _decoder(), 0
+            self._context, self._done = new_decoder("h264", "decoding recorded H.264"), 0
         while self._done <= index and (self._done == 0 or self._image is not None):  # damage ends the group
             self._image = _decode(self._context, self._units[self._done])
             self._done += 1
@@ -212,10 +212,6 @@ class Groups:
             self._group = Group()
         self._group.add(unit)
         return self._group, len(self._group) - 1
-
-
-def _decoder() -> VideoCodecContext:
-    return new_decoder("h264", "decoding recorded H.264")
 
 
 def _decode(context: VideoCodecContext, unit: bytes) -> Any:

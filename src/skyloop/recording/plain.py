@@ -43,20 +43,12 @@ def encode(sample: msgspec.Struct) -> bytes:
 
 
 def decode(data: bytes | memoryview, kind: type[T]) -> T:
-    """Decode a sample from JSON.
-
-    Raises:
-        FileFormatError: The data do not describe a sample of that type.
-    """
+    """Decode a sample from JSON. Raise ``FileFormatError`` if the data do not describe a sample of that type."""
     return from_plain(from_json(data), kind)
 
 
 def from_json(data: bytes | memoryview | str) -> Any:
-    """Decode arbitrary JSON.
-
-    Raises:
-        FileFormatError: The data are not JSON, or nested too deeply.
-    """
+    """Decode arbitrary JSON. Raise ``FileFormatError`` if the data are not JSON, or nested too deeply."""
     try:
         return msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -112,8 +104,7 @@ def to_plain(value: Any) -> Any:
 def from_plain(plain: Any, kind: type[T]) -> T:
     """Convert plain values back to a sample.
 
-    Raises:
-        FileFormatError: The values do not describe a sample of that type.
+    Raise ``FileFormatError`` if the values do not describe a sample of that type.
     """
     restore = _restorer(kind)  # type: ignore[arg-type]
     try:
@@ -125,9 +116,8 @@ def from_plain(plain: Any, kind: type[T]) -> T:
 def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
     """Return a JSON value unchanged if other programs can read it and it is nested at most ``depth`` levels deep.
 
-    Raises:
-        ValueError: An integer has more than 64 bits, which neither NumPy nor a packet can hold, or the value is nested
-            too deeply.
+    Raise ``ValueError`` if an integer has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
+    nested too deeply.
     """
     if isinstance(value, dict | list):
         if depth <= 0:
@@ -348,17 +338,13 @@ class Course:
 
     If the proxy's clock restarts because its computer rebooted, time continues from the last value, advanced by the
     time elapsed on the recorder's clock.
-
-    Attributes:
-        first_ns: Time of the first sample that has one.
-        newest_ns: Time of the newest sample.
-        shift_ns: Offset currently added to the samples' own times, to compensate for restarts of the proxy's clock.
     """
 
     def __init__(self, shift_ns: int = 0) -> None:
         """Start before the first sample, with a known shift if given."""
-        self.first_ns: int | None = None
-        self.newest_ns = 0
+        self.first_ns: int | None = None  #: time of the first sample that has one
+        self.newest_ns = 0  #: time of the newest sample
+        #: offset currently added to the samples' own times, to compensate for restarts of the proxy's clock
         self.shift_ns = shift_ns
         self._doubted_ns: int | None = None  # an implausible time, accepted if the next one agrees with it
         self._log_ns = 0  # log time of the newest sample

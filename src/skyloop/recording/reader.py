@@ -11,45 +11,17 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, Final, TypeGuard
+from typing import IO, Any, Final
 
 import msgspec
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError
 from skyloop.messages.frame import H264
-from skyloop.recording.layout import (
-    META_CLOCK,
-    META_END,
-    META_RECORDING,
-    TYPES,
-    VERSION,
-    Channel,
-    ClockPair,
-    DroneRecord,
-    End,
-    FrameRecord,
-    Start,
-    Topic,
-    decode,
-    from_metadata,
-    image_topic,
-    parse_topic,
-    video_topic,
-)
+from skyloop.recording import layout, scan
+from skyloop.recording.layout import Channel, ClockPair, DroneRecord, End, FrameRecord, Start, Topic
 from skyloop.recording.pictures import Groups, Picture, compressed
-from skyloop.recording.scan import (
-    MAX_TIME_NS,
-    Message,
-    Piece,
-    Scan,
-    find_channels,
-    indexed,
-    note,
-    open_file,
-    records,
-    scan,
-)
+from skyloop.recording.scan import Message, Piece, Scan
 
 #: Called with the fraction of a file read so far, 0 to 1.
 Progress = Callable[[float], object]
@@ -110,19 +82,20 @@ class Recording:
             UsageError: The file does not exist or can't be read.
             FileFormatError: It is not an MCAP file, or was not recorded by Skyloop.
         """
-        found = indexed(path) or scan(path)
+        found = scan.indexed(path) or scan.scan(path)
         texts = {record.name: record.metadata for record in found.metadata}
-        if META_RECORDING not in texts or META_CLOCK not in texts:
+        if layout.META_RECORDING not in texts or layout.META_CLOCK not in texts:
             raise FileFormatError(_foreign(found))
         try:
-            start, clock = from_metadata(texts[META_RECORDING], Start), from_metadata(texts[META_CLOCK], ClockPair)
-            end = from_metadata(texts[META_END], End) if META_END in texts else None
+            start = layout.from_metadata(texts[layout.META_RECORDING], Start)
+            clock = layout.from_metadata(texts[layout.META_CLOCK], ClockPair)
+            end = layout.from_metadata(texts[layout.META_END], End) if layout.META_END in texts else None
         except FileFormatError as error:
             raise FileFormatError(f"{found.path}: {error}") from None
-        if not 1 <= start.layout <= VERSION:
+        if not 1 <= start.layout <= layout.VERSION:
             raise FileFormatError(
-                f"{found.path} has layout {start.layout}, but this version of Skyloop reads layouts 1 to {VERSION}: "
-                "use the version that recorded it, or a newer one"
+                f"{found.path} has layout {start.layout}, but this version of Skyloop reads layouts 1 to "
+                f"{layout.VERSION}: use the version that recorded it, or a newer one"
             )
         return cls(found.path, start, clock, end, found)
 
@@ -163,7 +136,7 @@ class Recording:
     def series(self) -> list[Series]:
         """The channels in the file, sorted by topic. For a truncated file, the first access reads all of it."""
         if self.found.cut and not self._complete:
-            find_channels(self.found)
+            scan.find_channels(self.found)
         self._complete = True
         schemas = self.found.schemas
         return sorted(
@@ -171,7 +144,7 @@ class Recording:
                 Series(
                     channel.topic,
                     schemas[channel.schema_id].name if channel.schema_id in schemas else "",
-                    parse_topic(channel.topic),
+                    layout.parse_topic(channel.topic),
                 )
                 for channel in self.found.channels.values()
             ),
@@ -221,7 +194,7 @@ class Recording:
         wanted = None if topics is None else set(topics)
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
-        with open_file(self.path) as file:
+        with scan.open_file(self.path) as file:
             # Several threads feed a recorder: a slightly older message can come later, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
@@ -229,9 +202,11 @@ class Recording:
                 if not piece.end_ns or piece.end_ns >= from_ns:
                     held += (entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns)
                     held.sort(key=attrgetter("log_ns"))
-                    until = bisect_left(held, after.start_ns, key=attrgetter("log_ns")) if _has_start(after) else None
+                    until = len(held)
+                    if after is not None and after.start_ns > 0:  # otherwise the time of its first message is unknown
+                        until = bisect_left(held, after.start_ns, key=attrgetter("log_ns"))
                     yield from held[:until]
-                    held = [] if until is None else held[until:]
+                    held = held[until:]
                 if progress is not None:
                     progress(read / total)
 
@@ -293,7 +268,7 @@ class Recording:
     def decoded(self, entry: Entry, channel: Channel) -> Any:
         """Decode a message from one of Skyloop's own channels; if damaged, note it in :attr:`damaged`, return None."""
         try:
-            return decode(entry.data, TYPES[channel])
+            return layout.decode(entry.data, layout.TYPES[channel])
         except FileFormatError as error:
             self._bad[f"{entry.topic}: {error}"] += 1
             return None
@@ -303,12 +278,12 @@ class Recording:
     def _piece(self, file: IO[bytes], piece: Piece, wanted: Collection[str] | None) -> Iterator[Entry]:
         """Yield the messages in a part of the file, in file order."""
         channels = self.found.channels
-        for record in records(file, piece, self.found.damage):
+        for record in scan.records(file, piece, self.found.damage):
             if not isinstance(record, Message):
-                note(self.found, record)
+                scan.note(self.found, record)
                 continue
             channel = channels.get(record.channel_id)
-            if max(record.log_time, record.publish_time) > MAX_TIME_NS:
+            if max(record.log_time, record.publish_time) > scan.MAX_TIME_NS:
                 self._bad["a message with a time after the year 2262"] += 1
             elif channel is not None and (wanted is None or channel.topic in wanted):
                 yield Entry(channel.topic, record.log_time, record.publish_time, record.sequence, record.data)
@@ -344,15 +319,10 @@ class Recording:
 _Kind = tuple[str, bool]  # camera, and whether the image is the vehicle's own H.264
 
 
-def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
-    """Return whether the time of a piece's first message is known."""
-    return piece is not None and piece.start_ns > 0
-
-
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
     """Return the topics that hold images."""
-    found: dict[str, _Kind] = {image_topic(drone, camera): (camera, False) for camera in cameras}
-    return found | {video_topic(drone, camera): (camera, True) for camera in cameras}
+    found: dict[str, _Kind] = {layout.image_topic(drone, camera): (camera, False) for camera in cameras}
+    return found | {layout.video_topic(drone, camera): (camera, True) for camera in cameras}
 
 
 class _Pairs:

@@ -1,4 +1,4 @@
-"""Implement ``skyloop.record``: a recorder for connected drones, or for drones given by name."""
+"""Implement ``skyloop.record``: record drones, connected or given by name, in this process or in one of its own."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import msgspec
 
-from skyloop.child_process import ChildProcess, on_parent_end
+from skyloop.child_process import ChildProcess, leave_to_parent, on_parent_end
 from skyloop.client import Drone, connect
 from skyloop.client.channels import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known
 from skyloop.messages import EventKind, Severity
-from skyloop.recording.engine import Engine
+from skyloop.recording.backlog import Backlog
+from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
 from skyloop.recording.options import (
+    MB,
     Options,
     RecorderEvent,
     RecorderState,
@@ -32,6 +35,129 @@ from skyloop.recording.options import (
     channels_of,
     first_path,
 )
+from skyloop.recording.taps import Tap, check_names
+from skyloop.recording.translation import Translator
+from skyloop.recording.writer import FileWriter
+
+_TOO_SLOW: Final = "the disk or the encoder is too slow"
+
+
+class Engine:
+    """Records drones from :meth:`start` to :meth:`stop`."""
+
+    def __init__(
+        self,
+        drones: Sequence[Drone],
+        path: Path,
+        options: Options,
+        on_event: Callable[[RecorderEvent], None] = lambda _: None,
+        **writing: Any,
+    ) -> None:
+        """Initialise the recorder without opening a file. ``on_event`` is called on the writing thread.
+
+        Raise ``UsageError`` if two drones have the same name, or ``UnknownNameError`` if no drone has a camera named in
+        the options.
+        """
+        check_names(drones, "recording")
+        options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
+        self._on_event = on_event
+        self._backlog = Backlog(round(options.buffer_mb * MB))
+        self._taps = [Tap(number, drone, options, self._backlog) for number, drone in enumerate(drones)]
+        clock = ClockPair.now()
+        self._started_ns = clock.monotonic_ns
+        self._ended_ns: int | None = None
+        records = [
+            DroneRecord(drone.name, drone.uri, to_plain(drone.capabilities), drone.clock_offset_ns) for drone in drones
+        ]
+        translators = [
+            Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
+            for drone in drones
+        ]
+        self._writer = FileWriter(path, options, self._backlog, records, translators, clock, self._publish, **writing)
+        self._writer.dropped = lambda: self._counts(Tap.dropped)
+        self._writer.missed = lambda: self._counts(Tap.missed)
+        self._writer.each_second = self._report_drops
+        self._reported_unwritable = 0
+        self._reported: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
+
+    def start(self) -> None:
+        """Open the file and start recording.
+
+        Raise ``UsageError`` if the file can't be written, or ``SkyloopError`` if subscribing to a drone failed; the
+        file has been closed.
+        """
+        self._writer.start()
+        try:
+            for tap in self._taps:
+                tap.start()
+        except BaseException:
+            self.stop()
+            raise
+        leave_to_parent(self)
+
+    def forked(self) -> None:
+        """Leave the file to the parent process. Called in a child created by ``os.fork``."""
+        self._ended_ns = time.monotonic_ns()
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Write all received samples and close the file. Idempotent."""
+        if self._ended_ns is not None:
+            return
+        self._ended_ns = time.monotonic_ns()
+        for tap in self._taps:
+            tap.stop()
+        self._writer.stop(timeout_s)
+
+    @property
+    def status(self) -> Status:
+        """The current status. Safe to read from any thread."""
+        writer = self._writer
+        return Status(
+            writer.state,
+            writer.shown_reason,
+            str(writer.path),
+            tuple(map(str, writer.files)),
+            ((self._ended_ns or time.monotonic_ns()) - self._started_ns) / 1e9,
+            writer.bytes,
+            writer.messages,
+            self._backlog.size,
+            self._counts(Tap.dropped),
+            self._counts(Tap.missed),
+        )
+
+    def _counts(self, of: Callable[[Tap], dict[str, int]]) -> dict[str, dict[str, int]]:
+        return {tap.drone.name: counts for tap in self._taps if (counts := of(tap))}
+
+    # On the writing thread -------------------------------------------------------------------------------------
+
+    def _publish(self, text: str, severity: Severity) -> None:
+        for tap in self._taps:
+            self._publish_to(tap, text, severity)
+        self._on_event(RecorderEvent(text, severity))
+
+    def _publish_to(self, tap: Tap, text: str, severity: Severity) -> None:
+        """Write an event to the file and log it on the drone."""
+        tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
+        tap.drone.log.text(text, name="recording", severity=severity)
+
+    def _report_drops(self) -> None:
+        writer = self._writer
+        unwritable = writer.unwritable > self._reported_unwritable
+        self._reported_unwritable = writer.unwritable
+        for tap in self._taps:
+            tap.check_streams()
+            now = (tap.dropped(), tap.missed())
+            before, self._reported[tap] = self._reported[tap], now
+            if now == before:
+                continue
+            tap.put_drops(*now)
+            if now[0] != before[0]:
+                more = {channel: count - before[0].get(channel, 0) for channel, count in now[0].items()}
+                words = ", ".join(f"{count} of {channel}" for channel, count in more.items() if count)
+                why = f"can't be written ({writer.unwritable_why})" if unwritable else _TOO_SLOW
+                text = f"{tap.drone.name}: the recording leaves out {words}: {why}"
+                self._publish_to(tap, text, Severity.WARNING)
+                self._on_event(RecorderEvent(text, Severity.WARNING))
 
 
 class Recorder:
@@ -201,7 +327,7 @@ def record(
     return Recorder(several, where, options, bool(alone) if in_process is None else in_process)
 
 
-# The recorder's process -----------------------------------------------------------------------------------------
+# In a process of its own -----------------------------------------------------------------------------------------
 
 
 START_S: Final = 20.0  #: time allowed for the child to start recording
@@ -279,10 +405,8 @@ class RecorderProcess:
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
         """Start the child and wait until it records. ``on_event`` is called on the thread that reads its events.
 
-        Raises:
-            UsageError: The child can't record because an argument is invalid.
-            LinkError: The child can't record for another reason, or has ended.
-            NoAnswerError: The child does not start in time.
+        Raise ``UsageError`` if the child can't record because an argument is invalid, ``LinkError`` if the child can't
+        record for another reason, or has ended, or ``NoAnswerError`` if the child does not start in time.
         """
         self._on_event = on_event
         self._status = Status(path=order.path)
@@ -357,11 +481,7 @@ class RecorderProcess:
 
 
 def check_installed() -> None:
-    """Check that the extra is installed, so that the error is raised here rather than in a child.
-
-    Raises:
-        MissingExtraError: The extra ``[record]`` is not installed.
-    """
+    """Check that the extra is installed, so that the error is raised here rather than in a child."""
     from importlib.util import find_spec
 
     missing = [name for name in ("mcap", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]

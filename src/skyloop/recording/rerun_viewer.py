@@ -1,33 +1,66 @@
-"""Show drones in Rerun, in a viewer that is started or already running, or in a file; export a recording to a file."""
+"""Show drones in Rerun, in a viewer that is started or already running, or in a file; export a recording to a file.
+
+Samples become entities on the timeline ``capture`` (Unix time):
+
+=============================== =====================================================================
+``world/drones/NAME``           pose and axes
+``world/drones/NAME/CAMERA``    mounting, frustum, images, and drawings on them
+``world/paths/NAME``            path flown
+``cameras/NAME/CAMERA``         images of a camera with unknown mounting
+``plots/NAME/…``                attitude, velocity, altitude, battery, set-points, logged numbers
+``log/NAME``                    events and logged texts
+=============================== =====================================================================
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+import uuid
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from skyloop.client import Drone
 from skyloop.clock import nanoseconds
-from skyloop.errors import FileFormatError, LinkError, NoAnswerError, SkyloopError
+from skyloop.errors import FileFormatError, LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
+from skyloop.messages import (
+    ACTION_NAMES,
+    Annotation,
+    Applied,
+    CameraInfo,
+    Capabilities,
+    Event,
+    Feedback,
+    Intrinsics,
+    LogEntry,
+    Points,
+    Polyline,
+    Severity,
+)
+from skyloop.messages.command import SET_POINTS
 from skyloop.messages.frame import H264, Chain
+from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.messages.relayed import Text
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, FrameRecord
 from skyloop.recording.options import MB, VIDEO
 from skyloop.recording.pictures import Picture as RecordedPicture
 from skyloop.recording.reader import Progress, Recording
-from skyloop.recording.rerun_log import RerunLog, Shown, rerun_sdk
-from skyloop.recording.taps import check_names
+from skyloop.recording.taps import Source, check_names
+from skyloop.recording.translation import Path as Trail
 from skyloop.recording.translation import Picture
-from skyloop.recording.view import Source
 
 PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
@@ -42,7 +75,7 @@ _log = logging.getLogger(__name__)
 
 
 class RerunViewer:
-    """A :class:`skyloop.recording.view.Screen` that shows everything: Rerun does not report what is displayed."""
+    """A :class:`skyloop.recording.taps.Screen` that shows everything: Rerun does not report what is displayed."""
 
     def __init__(
         self,
@@ -246,3 +279,315 @@ def export_rrd(
 
 def _part_of(progress: Progress, first: float, parts: int) -> Progress:
     return lambda share: progress(first + share / parts)
+
+
+# Samples as Rerun entities ---------------------------------------------------------------------------------------
+
+
+TIMELINE: Final = "capture"
+APPLICATION: Final = "skyloop"
+_MOST_SERIES: Final = 64  # maximum number of series and of drawing sources, because applications choose their names
+_PATH_EVERY_NS: Final = 1_000_000_000  # interval between points of a path
+_FRUSTUM_M: Final = 0.3  # drawn size of a camera
+_LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+_STATE: Final[dict[str, tuple[str, ...]]] = {
+    "attitude": ("roll [rad]", "pitch [rad]", "yaw [rad]"),
+    "velocity": ("forward [m/s]", "left [m/s]", "up [m/s]"),
+    "altitude": ("altitude [m]",),
+    "battery": ("battery [0 to 1]",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A drone to show."""
+
+    name: str
+    capabilities: Capabilities
+    unix: Callable[[int], int]  #: converts a time on the drone's proxy's clock to Unix time [ns]
+
+
+class RerunLog:
+    """A Rerun recording. Must be used from a single thread."""
+
+    def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
+        """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
+
+        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
+        """
+        self._rr = rerun_sdk()
+        self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
+        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which means nothing in a recording
+        self._stream.set_log_tick_enabled(False)
+        self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
+        self._shown = drones
+
+    def save(self, path: Path) -> None:
+        """Write to a file. Raise ``UsageError`` if the file can't be written."""
+        try:
+            self._stream.save(str(path), default_blueprint=self._blueprint())
+        except (OSError, RuntimeError, ValueError) as error:
+            raise UsageError(f"can't write {path}: {error}") from None
+        self._begin()
+
+    def connect(self, url: str) -> None:
+        """Send to a viewer or a server, at an address such as ``rerun+http://127.0.0.1:9876/proxy``.
+
+        Raise ``UsageError`` if the address is invalid.
+        """
+        try:
+            self._stream.connect_grpc(url, default_blueprint=self._blueprint())
+        except (RuntimeError, ValueError) as error:
+            raise UsageError(f"{url} is not an address of a Rerun viewer: {error}") from None
+        self._begin()
+
+    def add(self, drone: int, sample: Any) -> None:
+        """Add a sample of the drone with this index, if samples of its type are drawn."""
+        self._drones[drone].add(sample)
+
+    def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
+        """Add a frame as an image file or H.264 access unit; the first H.264 frame must be a key frame."""
+        self._drones[drone].picture(record, data)
+
+    def taken(self, timeout_s: float) -> bool:
+        """Return whether the viewer or disk accepts all added samples within this time [s], which must be positive."""
+        try:
+            self._stream.flush(timeout_sec=timeout_s)
+        except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
+            return False
+        return True
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """Finish the file, or send the remaining data to the viewer, waiting up to ``timeout_s`` [s].
+
+        Raise ``LinkError`` if the viewer did not accept the remaining data, which are dropped.
+        """
+        if self.taken(timeout_s):
+            self._stream.disconnect()
+            return
+        # Disconnecting, now or when Python exits, could wait for the viewer forever.
+        threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
+        self._rr.unregister_shutdown()
+        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs, or is closed")
+
+    def _begin(self) -> None:
+        self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for drone in self._drones:
+            drone.begin()
+
+    def _blueprint(self) -> Any:
+        """Return the viewer's layout: world, cameras, plots, texts."""
+        import rerun.blueprint as views
+
+        cameras = [
+            views.Spatial2DView(origin=entity_of(drone.name, camera), name=f"{drone.name} {camera.name}")
+            for drone in self._shown
+            for camera in drone.capabilities.cameras
+        ]
+        plots = [
+            views.TimeSeriesView(origin=f"plots/{part(drone.name)}/{plot}", name=f"{drone.name} {plot}")
+            for drone in self._shown
+            for plot in (*_STATE, "set_points")
+        ]
+        return views.Blueprint(
+            views.Horizontal(
+                views.Vertical(
+                    views.Spatial3DView(origin="world", name="World"),
+                    views.TextLogView(origin="log", name="Log"),
+                    row_shares=[3, 1],
+                ),
+                views.Vertical(
+                    *([views.Grid(*cameras, name="Cameras")] if cameras else []),
+                    views.Grid(*plots, name="Plots") if len(self._shown) == 1 else views.Tabs(*plots, name="Plots"),
+                ),
+            ),
+            collapse_panels=True,
+        )
+
+
+class _Drone:
+    """Draws one drone."""
+
+    def __init__(self, rr: Any, stream: Any, drone: Shown) -> None:
+        self._rr = rr
+        self._stream = stream
+        self._drone = drone.name
+        self._name = part(drone.name)
+        self._unix = drone.unix
+        self._cameras = {camera.name: camera for camera in drone.capabilities.cameras}
+        self._lenses: dict[str, tuple[int, int, Intrinsics]] = {}
+        self._codecs: set[str] = set()
+        self._series: set[str] = set()
+        self._sources: set[tuple[str, str]] = set()
+        self._titled: set[str] = set()
+        self._path = Trail()
+        self._path_due_ns = 0
+        self._makers: dict[type, Callable[[Any], None]] = {
+            Feedback: self._feedback,
+            Applied: self._applied,
+            Event: self._event,
+            Annotation: self._annotation,
+            LogEntry: self._log,
+        }
+
+    def begin(self) -> None:
+        """Draw the static parts: axes and mountings."""
+        rr = self._rr
+        self._stream.log(f"world/drones/{self._name}", rr.TransformAxes3D(0.3), static=True)
+        for camera in self._cameras.values():
+            if camera.rotation is not None:
+                mounting = rr.Transform3D(
+                    translation=camera.position_m or (0.0, 0.0, 0.0), mat3x3=np.array(camera.rotation).reshape(3, 3)
+                )
+                self._stream.log(self._entity(camera.name), mounting, static=True)
+
+    def add(self, sample: Any) -> None:
+        maker = self._makers.get(type(sample))
+        if maker is not None:
+            maker(sample)
+
+    def picture(self, record: FrameRecord, data: bytes) -> None:
+        rr, header = self._rr, record.header
+        self._at(header.captured_ns)
+        camera = self._cameras.get(header.camera)
+        if header.intrinsics is not None:
+            self._lens(header.camera, header.width, header.height, header.intrinsics)
+        elif camera is not None and camera.intrinsics is not None:
+            self._lens(camera.name, camera.width, camera.height, camera.intrinsics)
+        entity = self._entity(header.camera)
+        if record.format != H264:
+            self._stream.log(entity, rr.EncodedImage(contents=data, media_type=f"image/{record.format}"))
+            return
+        if entity not in self._codecs:
+            self._codecs.add(entity)
+            self._stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.H264), static=True)
+        self._stream.log(entity, rr.VideoStream.from_fields(sample=data, is_keyframe=record.key))
+
+    # Kinds of samples -----------------------------------------------------------------------------------------------
+
+    def _at(self, proxy_ns: int) -> int:
+        at_ns = self._unix(proxy_ns)
+        self._stream.set_time(TIMELINE, timestamp=np.datetime64(at_ns, "ns"))
+        return at_ns
+
+    def _feedback(self, feedback: Feedback) -> None:
+        rr = self._rr
+        at_ns = self._at(feedback.captured_ns)
+        attitude = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
+        for plot, numbers in (
+            ("attitude", attitude),
+            ("velocity", feedback.velocity_m_s),
+            ("altitude", (feedback.altitude_m,)),
+            ("battery", (feedback.battery,)),
+        ):
+            if numbers is not None and any(number is not None for number in numbers):
+                self._plot(plot, _STATE[plot], numbers)
+        if None in attitude:
+            return
+        place = feedback.position_m or (0.0, 0.0, feedback.altitude_m or 0.0)
+        turned = rr.Quaternion(xyzw=quaternion_from_euler(*attitude))  # type: ignore[arg-type]  # none is None here
+        self._stream.log(f"world/drones/{self._name}", rr.Transform3D(translation=place, quaternion=turned))
+        if feedback.position_m is not None:
+            self._path.add(feedback.position_m)
+            if at_ns >= self._path_due_ns:
+                self._path_due_ns = at_ns + _PATH_EVERY_NS
+                self._stream.log(f"world/paths/{self._name}", rr.LineStrips3D([self._path.places]))
+
+    def _applied(self, applied: Applied) -> None:
+        if not isinstance(applied.applied, SET_POINTS):
+            return
+        fields = {name: getattr(applied.applied, name) for name in applied.applied.__struct_fields__}
+        numbers = [value for value in fields.values() if not isinstance(value, bool)]
+        names = [name for name, value in fields.items() if not isinstance(value, bool)]
+        if any(number is not None for number in numbers):
+            self._at(applied.applied_ns)
+            self._plot(f"set_points/{ACTION_NAMES[type(applied.applied)]}", names, numbers)
+
+    def _event(self, event: Event) -> None:
+        self._at(event.at_ns)
+        self._text(event.text, event.severity)
+
+    def _log(self, entry: LogEntry) -> None:
+        self._at(entry.at_ns)
+        if entry.text is not None:
+            self._text(f"{entry.name}: {entry.text}" if entry.name else entry.text, entry.severity)
+        elif entry.number is not None and _within(self._series, entry.name):
+            self._plot(f"logs/{part(entry.name)}", (entry.name,), (entry.number,))
+
+    def _annotation(self, annotation: Annotation) -> None:
+        if annotation.camera not in self._cameras or not _within(self._sources, (annotation.camera, annotation.source)):
+            return
+        rr = self._rr
+        self._at(annotation.captured_ns)
+        entity = f"{self._entity(annotation.camera)}/drawn/{part(annotation.source)}"
+        lines = [shape for shape in annotation.shapes if isinstance(shape, Polyline) and shape.points]
+        spots = [shape for shape in annotation.shapes if isinstance(shape, Points)]
+        texts = [shape for shape in annotation.shapes if isinstance(shape, Text)]
+        strips = [(*line.points, line.points[0]) if line.closed else line.points for line in lines]
+        self._stream.log(f"{entity}/lines", rr.LineStrips2D(strips, colors=[line.colour for line in lines]))
+        points = [(point, spot.colour) for spot in spots for point in spot.points]
+        self._stream.log(f"{entity}/points", rr.Points2D([p for p, _ in points], colors=[c for _, c in points]))
+        written = rr.Points2D(
+            [text.at for text in texts],
+            colors=[text.colour for text in texts],
+            labels=[text.text for text in texts],
+            show_labels=True,
+            radii=0.0,
+        )
+        self._stream.log(f"{entity}/texts", written)
+
+    # Internals -------------------------------------------------------------------------------------------------
+
+    def _plot(self, plot: str, names: Iterable[str], numbers: Iterable[float | None]) -> None:
+        entity = f"plots/{self._name}/{plot}"
+        if entity not in self._titled:
+            self._titled.add(entity)
+            self._stream.log(entity, self._rr.SeriesLines(names=list(names)), static=True)
+        values = [math.nan if number is None else number for number in numbers]  # drawn as a gap
+        self._stream.log(entity, self._rr.Scalars(values))
+
+    def _text(self, text: str, severity: Severity) -> None:
+        self._stream.log(f"log/{self._name}", self._rr.TextLog(text, level=_LEVELS[severity]))
+
+    def _lens(self, camera: str, width: int, height: int, lens: Intrinsics) -> None:
+        if self._lenses.get(camera) == (width, height, lens):
+            return
+        self._lenses[camera] = width, height, lens
+        pinhole = self._rr.Pinhole(
+            focal_length=(lens.fx, lens.fy),
+            principal_point=(lens.cx, lens.cy),
+            resolution=(width, height),
+            camera_xyz=self._rr.ViewCoordinates.RDF,
+            image_plane_distance=_FRUSTUM_M,
+        )
+        self._stream.log(self._entity(camera), pinhole)
+
+    def _entity(self, camera: str) -> str:
+        info = self._cameras.get(camera)
+        return f"cameras/{part(self._drone)}/{part(camera)}" if info is None else entity_of(self._drone, info)
+
+
+def entity_of(drone: str, camera: CameraInfo) -> str:
+    """Return a camera's entity, which is in the world if its mounting is known."""
+    return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
+
+
+def part(name: str) -> str:
+    """Quote a name for use as a part of an entity path."""
+    return str(rerun_sdk().escape_entity_path_part(name))
+
+
+def rerun_sdk() -> Any:
+    """Return Rerun's module."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise MissingExtraError("viewing in Rerun", "rerun", cause=str(error)) from None
+    return rerun
+
+
+def _within(known: set[Any], name: Any) -> bool:
+    """Return whether an application's name gets an entity; their number is limited."""
+    if name not in known and len(known) < _MOST_SERIES:
+        known.add(name)
+    return name in known

@@ -53,25 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = [
-    "AttachmentIndex",
-    "Channel",
-    "Message",
-    "Metadata",
-    "MetadataIndex",
-    "Opcode",
-    "Piece",
-    "ReadDataStream",
-    "Record",
-    "Scan",
-    "Schema",
-    "attachments",
-    "find_channels",
-    "note",
-    "open_file",
-    "records",
-    "scan",
-]
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +94,7 @@ class Scan:
 def scan(path: str | Path) -> Scan:
     """Scan a file once.
 
-    Raises:
-        UsageError: The file does not exist or can't be read.
-        FileFormatError: It is not an MCAP file.
+    Raise ``UsageError`` if the file does not exist or can't be read, or ``FileFormatError`` if it is not an MCAP file.
     """
     file_path = Path(path)
     with open_file(file_path) as file:
@@ -144,11 +124,7 @@ def attachments(found: Scan) -> Iterator[Attachment]:
 
 
 def open_file(path: Path) -> IO[bytes]:
-    """Open a file for reading.
-
-    Raises:
-        UsageError: The file can't be read; the message gives the reason.
-    """
+    """Open a file for reading. Raise ``UsageError`` if the file can't be read; the message gives the reason."""
     try:
         return path.open("rb")
     except OSError as error:
@@ -198,8 +174,7 @@ def chunk_head_size(compression: str) -> int:
 def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
     """Read the checksum of a chunk that is known only from the index.
 
-    Raises:
-        ValueError: There is no chunk at that place.
+    Raise ``ValueError`` if there is no chunk at that place.
     """
     size = chunk_head_size(piece.compression or "")
     file.seek(piece.offset - size)
@@ -351,8 +326,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
 def _parse(data: bytes, most: int) -> Iterator[Record]:
     """Yield records up to the end of the data, skipping one that is cut off there.
 
-    Raises:
-        ValueError: There are more than ``most`` records.
+    Raise ``ValueError`` if there are more than ``most`` records.
     """
     at, size = 0, len(data)
     for number in itertools.count():
@@ -395,8 +369,7 @@ _U32: Final = struct.Struct("<I")
 def indexed(path: str | Path) -> Scan | None:
     """Return the structure of a file from its index, or None if it has no reliable one.
 
-    Raises:
-        UsageError: The file does not exist or can't be read.
+    Raise ``UsageError`` if the file does not exist or can't be read.
     """
     file_path = Path(path)
     with open_file(file_path) as file:

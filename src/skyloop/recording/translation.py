@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import numpy as np
 
 from skyloop.errors import DecodeError
@@ -26,21 +28,50 @@ from skyloop.messages.relayed import MOCAP, unpack
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
-from skyloop.recording.output import Message
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message as Protobuf
 
 _SEQUENCES: Final = 1 << 32  # MCAP's sequence numbers have 32 bits
 _PLACES: Final = 400  #: maximum number of points in a path; when it is exceeded, every second one is removed
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between messages that hold a path
 
 
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message for the file. ``kind`` is the class of a Skyloop sample, or a protobuf class."""
+
+    topic: str
+    kind: type[msgspec.Struct | Protobuf]
+    data: bytes
+    log_ns: int  #: Unix time
+    publish_ns: int
+    sequence: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """Describes a kind of message to programs that do not know it."""
+
+    name: str
+    encoding: str  #: encoding of the schema itself
+    data: bytes
+    message_encoding: str
+
+    @classmethod
+    def of(cls, kind: type[Any]) -> Schema:
+        """Return the schema for a :class:`Message`'s kind."""
+        if issubclass(kind, msgspec.Struct):
+            return cls(layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind), layout.JSON)
+        return cls(kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind), layout.PROTOBUF)
+
+
+@dataclass(slots=True, eq=False)
 class Picture:
     """A frame in the form written to the file."""
 
-    __slots__ = ("data", "record")
-
-    def __init__(self, record: FrameRecord, data: bytes) -> None:
-        self.record = record
-        self.data = data
+    record: FrameRecord
+    data: bytes
 
 
 class Path:

@@ -1,28 +1,32 @@
-"""The writing thread: takes samples from the backlog, translates and writes them, and monitors the disk."""
+"""The writing thread: takes samples from the backlog, translates and writes them, and monitors the disk; its files."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import IO, Any, Final, Protocol, cast
 
 import msgspec
 
+from skyloop import __version__
 from skyloop.clock import beats, nanoseconds
-from skyloop.errors import UsageError
+from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import Severity
 from skyloop.messages.frame import H264, Chain
+from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, Start
+from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
-from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open_target
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import Message, Picture, Schema, Translator
 
+CHUNK: Final = MB  #: a chunk is closed after this many bytes, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
 _COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
 _REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
@@ -35,29 +39,161 @@ Tell = Callable[[str, Severity], None]
 _log = logging.getLogger(__name__)
 
 
-def free_space(folder: Path) -> int:
-    """Return the free bytes on a folder's disk.
+# One MCAP file: committed data stay readable whatever happens later ----------------------------------------------
 
-    Raises:
-        OSError: The disk can't be read.
+
+class Target(Protocol):
+    """An unbuffered file that is open for writing."""
+
+    def write(self, data: Any, /) -> int | None: ...
+    def truncate(self, size: int | None = None, /) -> int: ...
+    def fileno(self) -> int: ...
+    def close(self) -> None: ...
+
+
+Opener = Callable[[Path, bool], Target]
+
+
+def open_target(path: Path, overwrite: bool) -> Target:
+    """Open a file for unbuffered writing. Raise ``OSError`` if the file already exists, or can't be written."""
+    return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
+
+
+class Output:
+    """The MCAP writer's stream. Nothing reaches the file until :meth:`flush`, which writes everything or nothing."""
+
+    def __init__(self, target: Target) -> None:
+        self.committed = 0  #: bytes in the file, always ending at a record boundary
+        self.waiting = 0  #: bytes not yet in the file
+        self._target = target
+        self._pieces: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        """Append to the waiting data and return the number of bytes."""
+        self._pieces.append(data)
+        self.waiting += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the size of the file, including waiting data [bytes]."""
+        return self.committed + self.waiting
+
+    def flush(self) -> None:
+        """Write the waiting data to the file.
+
+        Raise ``OSError`` if the disk fails; the file still ends where it did before.
+        """
+        try:
+            for piece in self._pieces:
+                rest = memoryview(piece)
+                while rest:
+                    rest = rest[self._target.write(rest) or 0 :]
+        except OSError:
+            self._target.truncate(self.committed)
+            raise
+        else:
+            self.committed += self.waiting
+        finally:
+            self.waiting = 0
+            self._pieces.clear()
+
+
+class RecordingFile:
+    """An MCAP file being written; :meth:`commit` makes the messages part of the file.
+
+    Every method raises ``OSError`` if the disk fails; after that, only :meth:`abandon` may be called.
     """
+
+    def __init__(
+        self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
+    ) -> None:
+        """Create the file and write its metadata. ``clock`` relates monotonic to Unix time.
+
+        Raise ``OSError`` if the file can't be created or written.
+        """
+        try:
+            from mcap.writer import CompressionType, Writer
+        except ImportError as error:
+            raise MissingExtraError("recording", "record", cause=str(error)) from None
+        self.path = path  #: the file
+        self.written: Counter[str] = Counter()  #: number of messages by topic
+        self.count = 0  #: total number of messages
+        self._target = opener(path, overwrite)
+        self._output = Output(self._target)
+        self._writer = Writer(cast(IO[Any], self._output), chunk_size=CHUNK, compression=CompressionType.LZ4)
+        self._schemas: dict[type, int] = {}
+        self._channels: dict[str, int] = {}
+        try:
+            self._writer.start(layout.PROFILE, f"skyloop {start.skyloop}")
+            self._writer.add_metadata(layout.META_CLOCK, layout.to_metadata(clock))
+            self._writer.add_metadata(layout.META_RECORDING, layout.to_metadata(start))
+            self._output.flush()
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Size in bytes, including waiting data."""
+        return self._output.tell()
+
+    @property
+    def lost(self) -> bool:
+        """Whether the file was deleted. A file that was only moved is still written to."""
+        try:
+            return os.fstat(self._target.fileno()).st_nlink == 0
+        except OSError:
+            return True
+
+    def write(self, message: Message) -> None:
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._add_channel(message)
+        self._writer.add_message(channel, message.log_ns, message.data, message.publish_ns, message.sequence)
+        self.written[message.topic] += 1
+        self.count += 1
+
+    def commit(self) -> None:
+        """Close the chunk and write all waiting data to the file."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def close(self, end: End) -> None:
+        """Write the summary and close the file."""
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.add_metadata(layout.META_END, layout.to_metadata(end))
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._output.flush()
+        finally:
+            self._target.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, readable up to the last commit but without a summary. Remove it if it is empty."""
+        self._target.close()
+        if not self._output.committed:
+            self.path.unlink(missing_ok=True)
+
+    def _add_channel(self, message: Message) -> int:
+        schema = Schema.of(message.kind)
+        number = self._schemas.get(message.kind)
+        if number is None:
+            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[message.kind] = number
+        channel = self._writer.register_channel(message.topic, schema.message_encoding, number)
+        self._channels[message.topic] = channel
+        return channel
+
+
+# The writing thread ----------------------------------------------------------------------------------------------
+
+
+def free_space(folder: Path) -> int:
+    """Return the free bytes on a folder's disk. Raise ``OSError`` if the disk can't be read."""
     return shutil.disk_usage(folder).free
 
 
 class FileWriter:
-    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread.
-
-    Attributes:
-        state: State of the recorder.
-        reason: Why the recorder is paused or has failed.
-        files: All files, oldest first.
-        room: Which samples to write, given the space left on the disk.
-        unwritable: Samples that could not be translated.
-        unwritable_why: Channel and error of the last one.
-        dropped: Returns the totals of dropped samples by drone and channel, for the end of each file.
-        missed: Returns the totals of missed samples by drone and channel, for the end of each file.
-        each_second: Called each second on the writing thread.
-    """
+    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread."""
 
     def __init__(
         self,
@@ -73,15 +209,16 @@ class FileWriter:
         free: Callable[[Path], int] = free_space,
     ) -> None:
         """Initialise without opening a file. ``tell`` runs on the writing thread, or at first on :meth:`start`'s."""
-        self.state = RecorderState.STARTING
-        self.reason = ""
-        self.files: list[Path] = []
-        self.room = Room.ALL
+        self.state = RecorderState.STARTING  #: state of the recorder
+        self.reason = ""  #: why the recorder is paused or has failed
+        self.files: list[Path] = []  #: all files, oldest first
+        self.room = Room.ALL  #: which samples to write, given the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last one
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
+        #: returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
-        self.each_second: Callable[[], None] = lambda: None
+        self.each_second: Callable[[], None] = lambda: None  #: called each second on the writing thread
         self._path = path
         self._options = options
         self._backlog = backlog
@@ -91,7 +228,9 @@ class FileWriter:
         self._opener = opener
         self._free = free
         self._floor = round(options.min_free_mb * MB)
-        self._start = Start(VERSION, _version(), tuple(drones), clock.unix_ns, options=msgspec.to_builtins(options))
+        self._start = Start(
+            layout.VERSION, __version__, tuple(drones), clock.unix_ns, options=msgspec.to_builtins(options)
+        )
         self._file: RecordingFile | None = None
         self._uncommitted: list[Item] = []
         self._closed_bytes = self._closed_messages = 0
@@ -106,8 +245,7 @@ class FileWriter:
     def start(self) -> None:
         """Open the first file and start the thread.
 
-        Raises:
-            UsageError: The file can't be written, or the disk is too full.
+        Raise ``UsageError`` if the file can't be written, or the disk is too full.
         """
         folder = self._path.parent
         try:
@@ -336,7 +474,6 @@ class FileWriter:
             self._report(f"recording paused ({why}): data on disk is safe, new frames are dropped", Severity.ERROR)
 
     def _check_disk(self) -> None:
-        """Check the disk and the file."""
         file = self._file
         if file is not None and file.lost:
             self._pause(f"{file.path} was removed")
@@ -380,12 +517,3 @@ def _why(error: OSError) -> str:
     """Describe an error in words that users understand."""
     place = f": {error.filename}" if error.filename else ""
     return f"{error.strerror or error}{place}"
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("skyloop")
-    except PackageNotFoundError:
-        return "0+unknown"

@@ -28,30 +28,22 @@ _WAITING: Final = 4  #: number of a drone's services that may wait at the same t
 class Settings:
     """Options of a bridge.
 
-    Attributes:
-        drones: Names of running proxies; each becomes a namespace.
-        priority: Request the authority immediately with this priority, 0 (highest) to 31, and use the same priority in
-            the service. None: only the service requests it, with the default priority.
-        timeout_s: The drone hovers if ``cmd_vel`` is silent for this long; must be greater than 0 and at most 5 s.
-        map_frame: A common frame for all drones' ``odom``, if a single simulator or motion capture system locates them;
-            empty: none.
-        use_sim_time: Use the time from ``/clock`` for stamps.
-        domain: DDS domain; None: taken from ``ROS_DOMAIN_ID``.
-        subnet: Make the nodes visible to other machines, not only this one, unless the environment configures it.
-        arguments: Arguments for ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``.
-
-    Raises:
-        UsageError: A value is out of range, or two drones have the same name in ROS 2.
+    Raise ``UsageError`` if a value is out of range, or two drones have the same name in ROS 2.
     """
 
-    drones: tuple[str, ...]
+    drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace
+    #: request the authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
+    #: service. None: only the service requests it, with the default priority.
     priority: int | None = None
+    #: the drone hovers if ``cmd_vel`` is silent for this long; must be greater than 0 and at most 5 s
     timeout_s: float = 0.5
+    #: a common frame for all drones' ``odom``, if a single simulator or motion capture system locates them; empty: none
     map_frame: str = ""
-    use_sim_time: bool = False
-    domain: int | None = None
+    use_sim_time: bool = False  #: use the time from ``/clock`` for stamps
+    domain: int | None = None  #: DDS domain; None: taken from ``ROS_DOMAIN_ID``
+    #: make the nodes visible to other machines, not only this one, unless the environment configures it
     subnet: bool = False
-    arguments: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()  #: arguments for ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``
 
     def __post_init__(self) -> None:
         if not self.drones:

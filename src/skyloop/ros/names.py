@@ -29,15 +29,10 @@ _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree.
+    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree."""
 
-    Attributes:
-        drone: The drone's name, as a valid ROS 2 name.
-        map: The frame in which all drones' ``odom`` have the same origin; empty: none.
-    """
-
-    drone: str
-    map: str = ""
+    drone: str  #: the drone's name, as a valid ROS 2 name
+    map: str = ""  #: the frame in which all drones' ``odom`` have the same origin; empty: none
 
     @property
     def odom(self) -> str:
@@ -57,8 +52,7 @@ class Frames:
 def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
     """Return each drone's namespace, without a slash.
 
-    Raises:
-        UsageError: Two drones would have the same namespace.
+    Raise ``UsageError`` if two drones would have the same namespace.
     """
     found: dict[str, str] = {}
     for name in drones:
@@ -116,12 +110,6 @@ class _Callbacks(ctypes.Structure):
     )
 
 
-class _TypeHash(ctypes.Structure):
-    """``rosidl_type_hash_t`` of rosidl_runtime_c."""
-
-    _fields_ = (("version", ctypes.c_uint8), ("value", ctypes.c_uint8 * 32))
-
-
 _Find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 _Hash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 _kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of this process
@@ -130,8 +118,7 @@ _kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of
 def tf_message_type() -> type:
     """Return a type for a publisher of transforms that sends ready-made bytes.
 
-    Raises:
-        UnsupportedError: The message's package is not installed, and this version of rclpy is not supported.
+    Raise ``UnsupportedError`` if the message's package is not installed, and this version of rclpy is not supported.
     """
     try:
         installed: type = import_module("tf2_msgs.msg").TFMessage
@@ -171,7 +158,7 @@ def _borrowed() -> type:
     callbacks.namespace, callbacks.name = package.replace("/", "::").encode(), name.encode()
     support = _TypeSupport.from_buffer_copy(_TypeSupport.from_address(found))
     support.data = ctypes.addressof(callbacks)
-    type_hash = _TypeHash(1, (ctypes.c_uint8 * 32).from_buffer_copy(TYPE_HASH))
+    type_hash = ctypes.create_string_buffer(b"\x01" + TYPE_HASH, 33)  # rosidl_type_hash_t: version and 32 bytes
     address = ctypes.addressof(type_hash)
     get_hash = _Hash(lambda _: address)
     support.hash = ctypes.cast(get_hash, ctypes.c_void_p).value

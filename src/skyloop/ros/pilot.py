@@ -79,8 +79,7 @@ class Pilot:
     def request_authority(self) -> None:
         """Request the authority with the configured priority.
 
-        Raises:
-            AuthorityError: Another application, named in the error, holds the authority.
+        Raise ``AuthorityError`` if another application, named in the error, holds the authority.
         """
         self._drone.request_authority(self._priority)
 
@@ -153,10 +152,8 @@ class Pilot:
         """Return the arguments of ``go_to`` for a ``PoseStamped``.
 
         A pose drawn in a plane has no height, so z = 0 keeps the current height. A missing orientation keeps the
-        current heading.
-
-        Raises:
-            UsageError: The pose is in another frame, its numbers are not finite, or its height is unknown.
+        current heading. Raise ``UsageError`` if the pose is in another frame, its numbers are not finite, or its height
+        is unknown.
         """
         frame, place, turn = pose.header.frame_id, pose.pose.position, pose.pose.orientation
         allowed = [each for each in ("odom", self._frames.odom, self._frames.map) if each]
@@ -222,9 +219,8 @@ def _in_words_of_ros(error: SkyloopError) -> str:
 class Parameters:
     """Declares the drone's parameters on a node, writes values set through ROS, and shows changes made elsewhere.
 
-    Args:
-        node: The rclpy node. Setting a parameter waits for the drone's proxy.
-        drone: The drone, connected as a pilot, because writing needs the authority.
+    ``node``: the rclpy node. Setting a parameter waits for the drone's proxy. ``drone``: the drone, connected as a
+    pilot, because writing needs the authority.
     """
 
     def __init__(self, node: Any, drone: Drone) -> None:

@@ -19,13 +19,11 @@ from skyloop.errors import SkyloopError
 from skyloop.messages import Applied, Capabilities, Event, EventKind, Feedback, Idle, LogEntry, Severity
 from skyloop.proxy import Proxy
 from skyloop.recording.backlog import Backlog, Item, Rank
-from skyloop.recording.engine import Engine
 from skyloop.recording.layout import ClockPair, DroneRecord
 from skyloop.recording.options import MB, Options, RecorderEvent, RecorderState, Status
-from skyloop.recording.output import RecordingFile
-from skyloop.recording.recorder import RecorderProcess
+from skyloop.recording.recorder import Engine, RecorderProcess
 from skyloop.recording.translation import Translator
-from skyloop.recording.writer import FileWriter
+from skyloop.recording.writer import FileWriter, RecordingFile
 from skyloop.transport.memory import MemoryServer
 from tests.support import recording_files as files
 from tests.support.fake_vehicle import FakeVehicle

@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from skyloop.cockpit import recordings as recordings_module
-from skyloop.cockpit.recordings import MAX_CHILDREN, Recordings
-from skyloop.cockpit.reports import MAX_WAITING, Reports
+from skyloop.cockpit.recordings import MAX_CHILDREN, MAX_WAITING, Recordings, Reports
 from skyloop.cockpit.security import foreign, own_names
 from skyloop.errors import LinkError, RefusedError, UsageError
 from skyloop.recording.reader import describe
@@ -94,11 +93,11 @@ def test_a_report_that_takes_too_long_or_fails_is_reported(tmp_path: Path, monke
     children = Children(tmp_path)
 
     async def main() -> None:
-        monkeypatch.setattr("skyloop.cockpit.reports.REPORT_S", 0.05)
+        monkeypatch.setattr("skyloop.cockpit.recordings.REPORT_S", 0.05)
         with pytest.raises(LinkError, match=r"took longer than 0\.05 s"):
             await Reports(children.command).make(tmp_path / "a.mcap")
         assert not children.pids()
-        monkeypatch.setattr("skyloop.cockpit.reports.REPORT_S", 10.0)
+        monkeypatch.setattr("skyloop.cockpit.recordings.REPORT_S", 10.0)
         for said, told in (("echo no good >&2; exit 3", "no good"), ("true", "no report of a.mcap")):
             with pytest.raises(UsageError, match=told):
                 await Reports(lambda *_, said=said: ["sh", "-c", said]).make(tmp_path / "a.mcap")
@@ -114,7 +113,7 @@ def test_a_page_that_is_closed_ends_its_report(tmp_path: Path, monkeypatch: pyte
     folder.mkdir()
     (folder / "a.mcap").touch()
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
-    monkeypatch.setattr("skyloop.cockpit.reports.child_command", children.command)
+    monkeypatch.setattr("skyloop.cockpit.recordings.child_command", children.command)
     with served(recordings=folder) as address:
         line = http.client.HTTPConnection(address.removeprefix("http://"), timeout=5)
         line.request("GET", "/api/recordings/a.mcap/report")
@@ -127,7 +126,7 @@ def test_a_page_that_is_closed_ends_its_report(tmp_path: Path, monkeypatch: pyte
 def test_a_report_ends_with_the_process_that_requested_it(tmp_path: Path) -> None:
     fifo = tmp_path / "never.mcap"
     os.mkfifo(fifo)  # opening it blocks forever
-    command = [sys.executable, "-m", "skyloop.cockpit.reports", "report", str(fifo), str(tmp_path / "report.html")]
+    command = [sys.executable, "-m", "skyloop.cockpit.recordings", "report", str(fifo), str(tmp_path / "report.html")]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as child:
         assert child.stdin is not None
         with pytest.raises(subprocess.TimeoutExpired):

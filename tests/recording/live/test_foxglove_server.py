@@ -18,10 +18,10 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline
 from skyloop.recording import foxglove as schemas
-from skyloop.recording import foxglove_access as module
+from skyloop.recording import foxglove_server as module
 from skyloop.recording import layout, taps
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.foxglove_access import MAX_HEAD, OriginGuard, ParameterAccess, hidden_host
+from skyloop.recording.foxglove_server import MAX_HEAD, OriginGuard, ParameterAccess, hidden_host
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Picture
 from tests.recording.live.conftest import WAIT_S, Fly
@@ -36,7 +36,7 @@ pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop i
 import itertools
 
 from skyloop.recording.foxglove_server import WAITING, FoxgloveServer
-from skyloop.recording.view import View
+from skyloop.recording.taps import View
 
 __all__ = ["far"]
 Show = Callable[..., tuple[View, FoxgloveServer]]

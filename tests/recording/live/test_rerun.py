@@ -33,14 +33,13 @@ from skyloop.messages import (
 )
 from skyloop.messages.frame import H264
 from skyloop.messages.relayed import Text
-from skyloop.recording import rerun_log, rerun_viewer
+from skyloop.recording import rerun_viewer
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.reader import Recording
-from skyloop.recording.rerun_log import RerunLog, Shown
-from skyloop.recording.rerun_viewer import RerunViewer, export_rrd
+from skyloop.recording.rerun_viewer import RerunLog, RerunViewer, Shown, export_rrd
+from skyloop.recording.taps import View
 from skyloop.recording.translation import Picture
-from skyloop.recording.view import View
 from tests.recording.live.conftest import Fly
 from tests.recording.streams import film, write_film
 from tests.support import fake_rerun
@@ -238,7 +237,7 @@ def test_a_hanging_viewer_gets_nothing_until_it_continues(
 def test_without_rerun_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingExtraError, match=r"skyloop install rerun"):
-        rerun_log.rerun_sdk()
+        rerun_viewer.rerun_sdk()
 
 
 # Rerun's own programs ------------------------------------------------------------------------------------------------

@@ -308,7 +308,6 @@ class Page:
         self._way: list[Any] | None = None
 
     def add(self, html: str) -> None:
-        """Append HTML."""
         self._parts.append(html)
 
     def chart(self, title: str, unit: str, lines: Sequence[Line], limits: tuple[float, float]) -> None:
@@ -327,15 +326,10 @@ class Page:
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 
     def write(self, path: Path) -> None:
-        """Write the page.
-
-        Raises:
-            UsageError: The file can't be written.
-        """
+        """Write the page. Raise ``UsageError`` if the file can't be written."""
         write(path, self.html().encode())
 
     def html(self) -> str:
-        """Return the whole page."""
         style, script = (
             files("skyloop.recording.review").joinpath("static", name).read_text("utf-8") for name in _FILES
         )

@@ -38,19 +38,12 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """Defines the columns of each row.
+    """Defines the columns of each row."""
 
-    Attributes:
-        state: Names of the numbers in the state, from :data:`~skyloop.messages.rows.STATE`.
-        set_point: Kind of commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`.
-        cameras: Cameras whose images each row includes.
-        fps: Rows per second.
-    """
-
-    state: tuple[str, ...]
-    set_point: str
-    cameras: tuple[str, ...]
-    fps: float
+    state: tuple[str, ...]  #: names of the numbers in the state, from :data:`~skyloop.messages.rows.STATE`
+    set_point: str  #: kind of commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`
+    cameras: tuple[str, ...]  #: cameras whose images each row includes
+    fps: float  #: rows per second
 
     @property
     def action(self) -> tuple[str, ...]:
@@ -60,19 +53,13 @@ class Form:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One flight, or a part of one marked by the application.
+    """One flight, or a part of one marked by the application."""
 
-    Attributes:
-        task: The task, in words.
-        state: State when the first camera's image was captured, shape (rows, len(form.state)), float64.
-        action: Action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
-        frames_ns: Capture time of each row's image by camera, on the proxy's clock, shape (rows,).
-    """
-
-    task: str
-    state: Floats
+    task: str  #: the task, in words
+    state: Floats  #: state when the first camera's image was captured, shape (rows, len(form.state)), float64
+    #: action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64
     action: Floats
-    frames_ns: Mapping[str, Times]
+    frames_ns: Mapping[str, Times]  #: capture time of each row's image by camera, on the proxy's clock, shape (rows,)
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -82,9 +69,8 @@ class Episode:
 def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
     """Return the columns that every row of a recording can have.
 
-    Raises:
-        FileFormatError: The recording has no feedback, no set-points, or no frames of a camera.
-        UsageError: It was flown with several kinds of set-points, or with positions.
+    Raise ``FileFormatError`` if the recording has no feedback, no set-points, or no frames of a camera, or
+    ``UsageError`` if it was flown with several kinds of set-points, or with positions.
     """
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
@@ -112,18 +98,9 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     are ``1 / form.fps`` apart. Each has the newest image from every camera, the state at the first camera's capture
     time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering counts as
     a set-point of zeros. If an application logs arrays named ``action``, these are used as the actions instead: each
-    row has the first one at or after its image's capture, and a gap in them ends an episode.
-
-    Args:
-        tables: Tables of one drone.
-        form: Columns that each row has.
-        task: Name of the task where no mark gives one.
-
-    Returns:
-        The episodes that last at least a second.
-
-    Raises:
-        FileFormatError: A logged action has a different number of values than the form's set-points.
+    row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``: name of the task
+    where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError`` if a logged
+    action has a different number of values than the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -251,15 +228,10 @@ Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's images from all episodes at a steady rate, in an H.264 MP4 file, which an error removes.
-
-    Attributes:
-        width: Width of the images [px]; 0 until the first is added.
-        height: Height of the images [px].
-        repeated: Number of rows that repeat the previous image because theirs could not be decoded.
-    """
+    """One camera's images from all episodes at a steady rate, in an H.264 MP4 file, which an error removes."""
 
     def __init__(self, path: Path, fps: float) -> None:
+        #: number of rows that repeat the previous image because theirs could not be decoded
         self.width = self.height = self.repeated = 0
         self._path, self._fps = path, Fraction(fps).limit_denominator(1000)
         self._opened = ExitStack()
@@ -289,10 +261,8 @@ class Film:
     def add(self, recording: Recording, drone: str, camera: str, wanted_ns: Sequence[Times]) -> None:
         """Encode the images for a recording's rows, given by their capture times, episode by episode.
 
-        Raises:
-            FileFormatError: The first image can't be decoded.
-            UsageError: An image differs in size from the first.
-            MissingExtraError: OpenCV, or PyAV with x264, is not installed.
+        Raise ``FileFormatError`` if the first image can't be decoded, or ``UsageError`` if an image differs in size
+        from the first.
         """
         wanted = np.concatenate([np.empty(0, np.int64), *wanted_ns])
         at = 0

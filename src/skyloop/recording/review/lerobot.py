@@ -52,13 +52,8 @@ class Exported:
     repeated: int  #: number of images that could not be decoded and repeat the previous one
 
 
-@dataclass(slots=True)
-class _Flights:
-    """The episodes in one recording."""
-
-    recording: Recording
-    drone: str
-    episodes: list[Episode]
+#: A recording, the drone flown, and its episodes.
+_Flight = tuple[Recording, str, list[Episode]]
 
 
 def export_lerobot(
@@ -98,18 +93,16 @@ def export_lerobot(
     if not LEAST_FPS <= fps <= MOST_FPS:
         raise UsageError(f"fps is {fps!r} and must be from {LEAST_FPS:g} to {MOST_FPS:g}")
     form, flights = _read(recordings, drone, cameras, fps, task, doing)
-    whole = [episode for flight in flights for episode in flight.episodes]
+    whole = [episode for _, _, flown in flights for episode in flown]
     if not whole:
         raise FileFormatError("no recorded flight follows set-points for at least a second with images")
     writer.make_folders()
     films: dict[str, Film] = {}
     for camera in form.cameras:
         with Film(folder / "videos" / f"{IMAGES}{camera}" / f"{_FILE}.mp4", form.fps) as film:
-            for number, flight in enumerate(flights):
+            for number, (recording, name, flown) in enumerate(flights):
                 doing(f"encoding {camera}", number / len(flights))
-                film.add(
-                    flight.recording, flight.drone, camera, [episode.frames_ns[camera] for episode in flight.episodes]
-                )
+                film.add(recording, name, camera, [episode.frames_ns[camera] for episode in flown])
         films[camera] = film
     tasks = sorted({episode.task for episode in whole})
     rows = _rows(whole, form, tasks)
@@ -130,9 +123,9 @@ def _read(
     fps: float,
     task: str,
     doing: Doing,
-) -> tuple[Form, list[_Flights]]:
+) -> tuple[Form, list[_Flight]]:
     form: Form | None = None
-    flights = []
+    flights: list[_Flight] = []
     for number, recording in enumerate(recordings):
         doing("reading", number / len(recordings))
         name = recording.drone(drone).name
@@ -147,7 +140,7 @@ def _read(
                 f"{recording.path} has {_words(here)}, and {recordings[0].path} {_words(form)}: "
                 "export recordings that don't match separately, or choose the cameras that all have"
             )
-        flights.append(_Flights(recording, name, episodes(found, form, task)))
+        flights.append((recording, name, episodes(found, form, task)))
     if form is None:
         raise UsageError("no recording was given")
     return form, flights
@@ -240,9 +233,7 @@ def _info(whole: Sequence[Episode], form: Form, tasks: Sequence[str], films: Map
 class _Writer:
     """Writes the files of a dataset into a folder that is new or empty.
 
-    Raises:
-        UsageError: The folder is not empty.
-        MissingExtraError: PyArrow is not installed.
+    Raise ``UsageError`` if the folder is not empty.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -19,19 +19,8 @@ from skyloop.messages.frame import H264
 from skyloop.recording.layout import Channel
 from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Progress, Recording
-from skyloop.recording.review.charts import (
-    Floats,
-    Line,
-    Mark,
-    Page,
-    TimeAxis,
-    band_chart,
-    facts,
-    limits,
-    map_chart,
-    spans,
-    table,
-)
+from skyloop.recording.review import charts
+from skyloop.recording.review.charts import Floats, Line, Mark, Page, TimeAxis
 from skyloop.recording.review.summary import Summary, summarise
 from skyloop.recording.review.tables import Table, tables
 
@@ -62,8 +51,7 @@ def write_report(
 ) -> None:
     """Write the report with up to ``pictures`` key frames per camera. This reads the recording three times.
 
-    Raises:
-        UsageError: The file can't be written.
+    Raise ``UsageError`` if the file can't be written.
     """
     report_progress = progress or (lambda _: None)
     summary = summarise(recording, lambda share: report_progress(share / 3))
@@ -88,7 +76,7 @@ def make_page(recording: Recording, drone: str, found: dict[str, Table], summary
     way = None if feedback is None else way_of(feedback)
     _head(page, recording, drone, summary)
     frames = sum(len(one) for name, one in found.items() if name.startswith("frames."))
-    page.add(facts(flight_facts(feedback, commands, way, frames, axis.end_s)))
+    page.add(charts.facts(flight_facts(feedback, commands, way, frames, axis.end_s)))
     for note in (*summary.notes, *_losses(summary, drone)):
         page.add(f'<p class="note">{escape(note)}</p>')
     if feedback is None:
@@ -98,7 +86,7 @@ def make_page(recording: Recording, drone: str, found: dict[str, Table], summary
     page.add('<h2>Course <i class="sub now"></i></h2>')
     page.add(f'<section class="panel">{_bands(found, axis)}</section>')
     for title, unit, lines, least, zero in _charts(recording, drone, found):
-        page.chart(title, unit, lines, limits(lines, least_span=least, zero=zero))
+        page.chart(title, unit, lines, charts.limits(lines, least_span=least, zero=zero))
     return page
 
 
@@ -128,9 +116,9 @@ def _path(page: Page, feedback: Table, way: Way) -> None:
         '<h2>Path</h2><div class="pair"><section class="panel"><header><h3>From above<i>m, x east, y north</i></h3>'
     )
     page.add(f'<span class="sub">{escape(way.source)}; from blue to orange</span></header>')
-    page.add(map_chart("path", way.x, way.y, way.t_s) + "</section>")
+    page.add(charts.map_chart("path", way.x, way.y, way.t_s) + "</section>")
     page.add('<section class="panel"><header><h3>From the side<i>m, height over x</i></h3></header>')
-    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude_m") else "<p>unknown</p>")
+    page.add(charts.map_chart("side", way.x, high.values, t_s) if feedback.known("altitude_m") else "<p>unknown</p>")
     page.add("</section></div>")
 
 
@@ -145,11 +133,11 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
             ("failsafe", "failsafe", _FAILSAFES),
             ("link", "vehicle_link", _LINKS),
         ):
-            rows.append((title, spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
+            rows.append((title, charts.spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
     if commands is not None:
         asked = np.where(commands["app_id"] > 0, commands["asked"], "")
-        rows.append(("requested", spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
-    return band_chart("bands", [row for row in rows if row[1]], marks(found.get("events")), axis)
+        rows.append(("requested", charts.spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
+    return charts.band_chart("bands", [row for row in rows if row[1]], marks(found.get("events")), axis)
 
 
 def _charts(
@@ -267,7 +255,7 @@ def _events(page: Page, events: Table | None) -> None:
         for t, kind, text, app, severity in list(zip(*columns, strict=True))[:_MOST_EVENTS]
     ]
     more = len(events) - _MOST_EVENTS
-    page.add("<h2>Events</h2>" + table(("time [s]", "kind", "application", "what"), rows, ("n", "", "", "")))
+    page.add("<h2>Events</h2>" + charts.table(("time [s]", "kind", "application", "what"), rows, ("n", "", "", "")))
     if more > 0:
         page.add(f'<p class="sub">and {more} more</p>')
 
@@ -290,7 +278,7 @@ def _channels(page: Page, summary: Summary) -> None:
         for row in summary.rows
     ]
     head = ("channel", "count", "rate [Hz]", "gaps", "missing", "size [MB]", "delay [ms]: median (p99)")
-    page.add("<h2>Channels</h2>" + table(head, rows, ("", "n", "n", "n", "n", "n", "")))
+    page.add("<h2>Channels</h2>" + charts.table(head, rows, ("", "n", "n", "n", "n", "n", "")))
 
 
 # Path and figures -----------------------------------------------------------------------------------------------

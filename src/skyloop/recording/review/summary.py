@@ -193,8 +193,7 @@ def problems(recording: Recording, progress: Progress | None = None) -> tuple[st
 def recover(recording: Recording, target: Path, progress: Progress | None = None) -> Recovered:
     """Write everything that is readable to a new file, which appears only once it is complete.
 
-    Raises:
-        UsageError: ``target`` already exists, or can't be written.
+    Raise ``UsageError`` if ``target`` already exists, or can't be written.
     """
     from mcap.writer import CompressionType, Writer
 

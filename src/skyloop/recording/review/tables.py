@@ -59,7 +59,6 @@ class Table:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """Return a column."""
         return self.columns[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
@@ -259,11 +258,7 @@ def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
-    """Write ``CHANNEL.parquet`` for each table; unknown values are null.
-
-    Raises:
-        MissingExtraError: PyArrow is not installed.
-    """
+    """Write ``CHANNEL.parquet`` for each table; unknown values are null."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -292,11 +287,7 @@ def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
 def read(
     recording: Recording, drone: str, channels: Collection[Channel] | None, progress: Progress | None = None
 ) -> dict[str, Table]:
-    """Read the tables to export.
-
-    Raises:
-        FileFormatError: The recording has none of these channels.
-    """
+    """Read the tables to export. Raise ``FileFormatError`` if the recording has none of these channels."""
     found = tables(recording, drone, channels or TABLES, progress)
     if not found:
         raise FileFormatError(f"{recording.path} holds none of these channels of {drone}")

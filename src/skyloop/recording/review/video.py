@@ -259,10 +259,7 @@ class StreamCopy:
 
     The stream changes when its parameter sets do: an MP4 file has only one set, at its start. A frame that can't be
     decoded and all frames up to the next key frame are left out; the frame before them stays on screen until then.
-
-    Args:
-        path: The first file.
-        opened: Closes the files, which get their final names only at that point.
+    ``opened``: closes the files, which get their final names only at that point.
     """
 
     def __init__(self, path: Path, opened: ExitStack) -> None:
@@ -277,9 +274,8 @@ class StreamCopy:
     def add(self, picture: Picture) -> None:
         """Copy a frame, or skip it.
 
-        Raises:
-            TooManyChangesError: The stream would need more than :data:`MAX_FILES` files.
-            OSError: The file can't be written.
+        Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, or ``OSError`` if the
+        file can't be written.
         """
         file = self._file_for(picture)
         self._whole = file is not None
