@@ -12,16 +12,7 @@ from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError, SkyloopError
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    EventKind,
-    Intrinsics,
-    Parameter,
-    Refusal,
-    Severity,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, EventKind, Intrinsics, Parameter, Refusal, Severity, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
 from skyloop.vehicles.ardrone.link import ArdroneLink

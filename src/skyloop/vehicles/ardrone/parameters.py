@@ -79,10 +79,7 @@ _COMMON: Final = (
     _Common("camera.fps", "video:codec_fps", "1/s", 1, "pictures a second of the video"),
 )
 CHANNEL_KEY: Final = "video:video_channel"
-_CHANNELS: Final = {
-    1: ("front", "bottom", "front_with_bottom", "bottom_with_front"),
-    2: ("front", "bottom"),
-}
+_CHANNELS: Final = {1: ("front", "bottom", "front_with_bottom", "bottom_with_front"), 2: ("front", "bottom")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,9 +274,7 @@ def _widened(parameter: Parameter) -> Parameter:
         return parameter
     low, high = parameter.minimum, parameter.maximum
     return msgspec.structs.replace(
-        parameter,
-        minimum=low if low is None else min(low, value),
-        maximum=high if high is None else max(high, value),
+        parameter, minimum=low if low is None else min(low, value), maximum=high if high is None else max(high, value)
     )
 
 

@@ -77,12 +77,7 @@ class ArdroneSession(VehicleSession):
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
     def __init__(
-        self,
-        options: ArdroneOptions,
-        ids: Ids,
-        now_ns: int,
-        *,
-        extra: Callable[[], Mapping[str, Value]] = dict,
+        self, options: ArdroneOptions, ids: Ids, now_ns: int, *, extra: Callable[[], Mapping[str, Value]] = dict
     ) -> None:
         super().__init__(now_ns)
         self.options = options

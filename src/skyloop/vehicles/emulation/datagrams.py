@@ -211,13 +211,7 @@ class ByteServer:
     """
 
     def __init__(
-        self,
-        loop: Loop,
-        bind: Address,
-        on_bytes: Callable[[bytes], None],
-        on_client: Callable[[], None],
-        *,
-        name: str,
+        self, loop: Loop, bind: Address, on_bytes: Callable[[bytes], None], on_client: Callable[[], None], *, name: str
     ) -> None:
         self._loop = loop
         self._on_bytes = on_bytes

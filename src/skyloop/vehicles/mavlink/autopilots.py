@@ -203,14 +203,7 @@ class ArduCopterProfile(AutopilotProfile):
     BYTEWISE = False
     SAFETY_NETS = (
         _SafetyNet("FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until the battery is empty", 7),
-        _SafetyNet(
-            "FS_GCS_TIMEOUT",
-            "time until its loss counts",
-            lambda s: s <= 5,
-            "it takes over 5 s",
-            5,
-            "s",
-        ),
+        _SafetyNet("FS_GCS_TIMEOUT", "time until its loss counts", lambda s: s <= 5, "it takes over 5 s", 5, "s"),
         _SafetyNet("GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it keeps flying for too long", 1, "s"),
         _SafetyNet("FS_EKF_ACTION", "loss of position", _on, "it does nothing", 1),
         _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing", 1),
@@ -290,14 +283,7 @@ class Px4Profile(AutopilotProfile):
     BYTEWISE = True
     SAFETY_NETS = (
         _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "it only drops the last set-point", 1),
-        _SafetyNet(
-            "COM_DL_LOSS_T",
-            "time until its loss counts",
-            lambda s: s <= 10,
-            "it takes over 10 s",
-            5,
-            "s",
-        ),
+        _SafetyNet("COM_DL_LOSS_T", "time until its loss counts", lambda s: s <= 10, "it takes over 10 s", 5, "s"),
         _SafetyNet(
             "COM_OF_LOSS_T",
             "time until set-points are missed",
@@ -314,14 +300,7 @@ class Px4Profile(AutopilotProfile):
             5,
         ),
         _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "it only warns", 2),
-        _SafetyNet(
-            "GF_MAX_VER_DIST",
-            "ceiling",
-            lambda height: height > 0,
-            "it has none of its own",
-            30,
-            "m",
-        ),
+        _SafetyNet("GF_MAX_VER_DIST", "ceiling", lambda height: height > 0, "it has none of its own", 30, "m"),
     )
 
     def mode_of(self, custom_mode: int) -> str:

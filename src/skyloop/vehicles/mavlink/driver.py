@@ -11,15 +11,7 @@ from skyloop.drivers.live_camera import LiveCamera
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import deliver
 from skyloop.errors import DriverError, ParameterError
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    Hover,
-    Land,
-    Parameter,
-    Refusal,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, Hover, Land, Parameter, Refusal, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.link import MavlinkLink
 from skyloop.vehicles.mavlink.microservices import pose_message
@@ -177,9 +169,5 @@ class MavlinkDriver(Driver):
         return vehicle_parameters(reported)
 
 
-_ARMING: Final = {
-    True: "it reports that it can be armed",
-    False: "it can't be armed and refuses to take off",
-    None: "",
-}
+_ARMING: Final = {True: "it reports that it can be armed", False: "it can't be armed and refuses to take off", None: ""}
 _PREARM: Final = "see its messages (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"

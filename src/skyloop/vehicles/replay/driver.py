@@ -13,17 +13,7 @@ from skyloop.drivers.base import Driver, Sink, reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.files import expand
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    EventKind,
-    Hover,
-    Land,
-    LinkState,
-    Parameter,
-    Severity,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, EventKind, Hover, Land, LinkState, Parameter, Severity, Value
 from skyloop.recording.layout import DroneRecord
 from skyloop.recording.reader import Recording
 from skyloop.vehicles.replay.playback import NAMES, SPEEDS, Playback

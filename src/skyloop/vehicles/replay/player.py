@@ -14,17 +14,7 @@ import msgspec
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.errors import SkyloopError, UsageError
-from skyloop.messages import (
-    AnyAction,
-    Applied,
-    Event,
-    EventKind,
-    Feedback,
-    LinkState,
-    Parameter,
-    Severity,
-    Value,
-)
+from skyloop.messages import AnyAction, Applied, Event, EventKind, Feedback, LinkState, Parameter, Severity, Value
 from skyloop.recording.pictures import Picture
 from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback, Wanted
 from skyloop.vehicles.replay.source import Moment, ReplaySource, TimedSample, Timeline

@@ -30,14 +30,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.ros2.options import Options
-from skyloop.vehicles.ros2.wire import (
-    euler_of,
-    intrinsics_of,
-    levelled_velocity,
-    nanoseconds_of,
-    pixels_of,
-    skew_of,
-)
+from skyloop.vehicles.ros2.wire import euler_of, intrinsics_of, levelled_velocity, nanoseconds_of, pixels_of, skew_of
 
 PERIOD_S: Final = 0.05  #: time between repeats of a velocity, because robots stop if they receive none
 AIRBORNE_M: Final = 0.1  #: height in the odometry above which a robot counts as flying

@@ -307,12 +307,7 @@ class SimDriver(Driver):
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
-                model.name,
-                pixels,
-                captured_ns,
-                width=model.width,
-                height=model.height,
-                intrinsics=model.intrinsics(),
+                model.name, pixels, captured_ns, width=model.width, height=model.height, intrinsics=model.intrinsics()
             )
 
     def failed(self, error: Exception) -> None:

@@ -303,12 +303,7 @@ class CameraPublisher:
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
-                self._camera,
-                pixels,
-                due_ns,
-                width=width,
-                height=height,
-                intrinsics=self._intrinsics(width, height),
+                self._camera, pixels, due_ns, width=width, height=height, intrinsics=self._intrinsics(width, height)
             )
         return not self.stop.is_set()
 
