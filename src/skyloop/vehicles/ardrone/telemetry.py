@@ -20,8 +20,18 @@ from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.wire.configuration import NO_CEILING_MM
-from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode
-from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, PhysMeasures, RawMeasures, Time, VisionDetect
+from skyloop.vehicles.ardrone.wire.navdata import (
+    LAYOUTS,
+    ControlState,
+    Demo,
+    Navdata,
+    PhysMeasures,
+    RawMeasures,
+    State,
+    Time,
+    VisionDetect,
+    decode,
+)
 
 # Reception -----------------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Faults, Ports, with_ardrones
-from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder

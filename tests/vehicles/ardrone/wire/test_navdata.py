@@ -11,16 +11,20 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.ardrone.wire import options
-from skyloop.vehicles.ardrone.wire.navdata import MAX_DATAGRAM, ControlState, State, decode, encode
-from skyloop.vehicles.ardrone.wire.options import (
+from skyloop.vehicles.ardrone.wire.navdata import (
     BY_TAG_AND_SIZE,
     LAYOUTS,
+    MAX_DATAGRAM,
+    ControlState,
     Demo,
     Gps,
+    State,
     Time,
     VisionDetect,
     Wifi,
     Zimmu3000,
+    decode,
+    encode,
 )
 from tests.support.recordings import content, needs_recordings
 
