@@ -264,17 +264,10 @@ def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
 
 
 class Setup:
-    """The steps that set up one drone.
+    """The steps that set up one drone, with our own ids and the keys ``remembered`` from before a link loss.
 
     Once the steps are done, ``version`` is known, unless the drone does not report it, and ``refused_ids`` is True if
-    the drone did not accept our own settings.
-
-    Args:
-        options: Options of the vehicle's address.
-        configurator: Runs the steps.
-        ids: Our own ids.
-        remembered: Keys that an application wrote before the link was lost; those that the drone has since forgotten
-            are written again.
+    the drone did not accept our own settings. Remembered keys that the drone has since forgotten are written again.
     """
 
     def __init__(

@@ -93,11 +93,7 @@ class Entry:
     names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if it has no named values
 
     def to_text(self, value: Value) -> str:
-        """Convert a value to the drone's notation.
-
-        Raises:
-            ParameterError: The value has the wrong type, is not finite, or is not one of the names.
-        """
+        """Convert a value to the drone's notation; raise :class:`ParameterError` if its type or name does not fit."""
         if self.names:
             if value not in self.names:
                 raise _wrong(self.parameter, f"is one of {', '.join(self.names)}")
@@ -112,11 +108,7 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """Convert the drone's text to a value.
-
-        Raises:
-            DecodeError: The text does not fit the key's type.
-        """
+        """Convert the drone's text to a value; raise :class:`DecodeError` if it does not fit the key's type."""
         value = parse_value(text, self.like)
         if self.names:
             number = int(str(value))
@@ -359,9 +351,8 @@ class Commands:
     def write(self, parameter: Parameter, value: Value) -> Value:
         """Send a command and return the parameter's new value.
 
-        Raises:
-            ParameterError: The value is invalid, or the command requires the drone to be on the ground (or in the air)
-                and it is not.
+        Raises :class:`ParameterError` for an invalid value, or if the drone must be on the ground (or in the air) and
+        is not.
         """
         value = checked_value(parameter, value)
         name = parameter.name

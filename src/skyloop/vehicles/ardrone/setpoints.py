@@ -191,19 +191,11 @@ class SetpointController:
     # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
+        """Accept one of the driver's ``ACTIONS``.
 
-        Args:
-            action: One of the driver's ``ACTIONS``.
-            now_ns: The present time.
-
-        Returns:
-            The applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
-            emergency stop is in force.
-
-        Raises:
-            DriverError: A take-off while the drone is silent or in an emergency, a reset while it is silent, or an
-                action that the drone does not support.
+        Returns the applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
+        emergency stop is in force. Raises :class:`DriverError` for a take-off while the drone is silent or in an
+        emergency, and for a reset while it is silent.
         """
         if isinstance(action, Idle):
             return action
@@ -288,11 +280,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        Args:
-            condition: The navdata's content.
-            now_ns: The present time.
-            passed_ns: The drone's own time since the previous navdata; None if it is the same as here. It distinguishes
-                delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. It
+        distinguishes delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns

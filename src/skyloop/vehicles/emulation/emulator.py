@@ -31,13 +31,8 @@ class RunningEmulator(ABC):
     """Firmware that runs from its construction to :meth:`stop`, which a constructor that fails half-way calls too.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
-    read values that are replaced as a whole.
-
-    Args:
-        host: The simulated world.
-        drone: Number of the drone in that world.
-        loop: Name for the loop's thread; or a shared loop, which its creator starts after the firmware and stops
-            before it.
+    read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, which its
+    creator starts after the firmware and stops before it.
     """
 
     def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:

@@ -65,8 +65,7 @@ class ClimbRateThrust:
 class CollectiveThrust:
     """Thrust field for PX4: collective thrust, computed by a loop that holds the climb rate.
 
-    Args:
-        hover: The hover thrust (``MPC_THR_HOVER``); an implausible value is replaced by 0.5.
+    An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -158,13 +157,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether a take-off is complete.
-
-        Args:
-            vehicle: The vehicle's state.
-            height_m: The take-off height.
-            rose: Whether the vehicle has been in the air since the take-off was accepted.
-        """
+        """Return whether a take-off is complete; ``rose``: it has been in the air since the take-off was accepted."""
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:

@@ -210,13 +210,8 @@ class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
     Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request.
-
-    Args:
-        autopilot: The autopilot's profile.
-        height_m: Height above the start.
-        now_ns: Start of the take-off.
-        disarms: Whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
+    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request,
+    ``disarms`` whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:

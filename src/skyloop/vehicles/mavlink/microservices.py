@@ -40,10 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Args:
-        system: System id of the vehicle; None selects the first one found and keeps to that system from then on.
-        peer: Address and port of the vehicle; None for any.
-        component: Component id of the vehicle.
+    Without a system id it selects the first one found and keeps to that system from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:

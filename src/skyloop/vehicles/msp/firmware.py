@@ -271,11 +271,9 @@ _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
 class Identification:
-    """Requests everything that :class:`Setup` contains.
+    """Requests everything that :class:`Setup` contains, then calls ``done``.
 
-    Args:
-        questions: The queue of requests.
-        done: Called at the end. The setup's variant is empty if the flight controller did not identify itself.
+    The setup's variant is empty if the flight controller did not identify itself.
     """
 
     def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:

@@ -81,11 +81,7 @@ class _Entry:
 
 
 class DriverParameters:
-    """The driver's own parameters.
-
-    Args:
-        setpoints: The controller that uses them. The caller must hold the lock that protects it.
-    """
+    """The driver's own parameters. The caller must hold the lock that protects the controller that uses them."""
 
     def __init__(self, setpoints: SetpointController) -> None:
         self._setpoints = setpoints

@@ -111,8 +111,7 @@ class Report:
 class SetpointController:
     """Stores the last set-point and turns it into receiver channels.
 
-    Args:
-        override: Whether a pilot keeps a real receiver, in which case only the pilot arms.
+    With ``override`` a pilot keeps a real receiver, and only the pilot arms.
     """
 
     def __init__(self, override: bool = False) -> None:
@@ -174,18 +173,10 @@ class SetpointController:
     # Decisions -----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
+        """Accept one of the driver's ``ACTIONS``; return the action in force, within the limits.
 
-        Args:
-            action: One of the driver's ``ACTIONS``.
-            now_ns: The present time.
-
-        Returns:
-            The action in force, within the limits.
-
-        Raises:
-            DriverError: The vehicle is on the ground and can't be armed for this climb, or a reset was requested while
-                the motors were still running.
+        Raises :class:`DriverError` if the vehicle is on the ground and can't be armed for this climb, or a reset was
+        requested while the motors were still running.
         """
         if isinstance(action, EmergencyStop):
             self.stop.press(now_ns)

@@ -107,16 +107,12 @@ class Stream:
 
 
 class Telemetry:
-    """Requests states at their rates, a few at a time.
+    """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
-    in its buffers, and so would the sticks behind them. A reply to ``MULTIPLE`` does not say what it contains, so there
-    is only one bundle: if a reply is lost, the next one can't be mistaken for it.
-
-    Args:
-        streams: Rates in hertz by function.
-        bundle: Functions requested together, at the rate of the first one, from firmware that supports ``MULTIPLE``.
-        most: Maximum number of unanswered requests.
+    in its buffers, and so would the sticks behind them: at most ``most`` are unanswered. A reply to ``MULTIPLE``, which
+    newer firmware supports, does not say what it contains, so there is only one ``bundle``, requested at the rate of
+    its first function: if a reply is lost, the next one can't be mistaken for it.
     """
 
     def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:

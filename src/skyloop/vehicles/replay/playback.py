@@ -33,10 +33,7 @@ class Wanted:
 class Playback:
     """A replay's position, speed and pause. Thread-safe.
 
-    Args:
-        duration_s: Length of the recording.
-        speed: Recorded seconds per second.
-        in_step: Whether its application advances it (``speed=max``), in which case no parameter can be written.
+    With ``in_step`` (``speed=max``) its application advances it, and no parameter can be written.
     """
 
     def __init__(self, duration_s: float, speed: float = 1.0, *, in_step: bool = False) -> None:

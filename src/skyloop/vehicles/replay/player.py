@@ -198,13 +198,7 @@ LATE_NS: Final = 250_000_000  #: if further behind than this, postpone the sched
 class Player:
     """Plays in real time on the thread that calls :meth:`run`, controlled by its playback.
 
-    Args:
-        source: The recording.
-        sink: The proxy's sink.
-        playback: Position, speed and pause.
-        loop: Whether to start over at the end.
-        clock: The monotonic clock [ns].
-        wait: Waits for a number of seconds or until the playback changes; None to wait in real time.
+    ``wait`` waits for a number of seconds or until the playback changes; None to wait in real time.
     """
 
     def __init__(

@@ -153,14 +153,8 @@ class RobotSession:
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
         """Accept an action that is among the capabilities.
 
-        Args:
-            action: The action.
-            new: Whether an application has just requested it. A repeated take-off or landing does not call the service
-                again.
-
-        Raises:
-            DriverError: The robot does not offer the service, is silent when asked to take off, or has already refused
-                this take-off.
+        A repeated take-off or landing (not ``new``) does not call the service again. Raises :class:`DriverError` if the
+        robot does not offer the service, is silent when asked to take off, or has already refused this take-off.
         """
         with self._lock:
             if isinstance(action, Velocity):

@@ -197,12 +197,7 @@ class SimDriver(Driver):
         return [*table.describe(self._present(), self._standard()), *surroundings, *firmware]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. The wind is shared by the whole world.
-
-        Raises:
-            UnknownNameError: There is no parameter with this name.
-            ParameterError: The value is invalid.
-        """
+        """Write a parameter; raise an error for an unknown name or an invalid value. The wind is the whole world's."""
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
         with self._changing:

@@ -145,11 +145,8 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 class TelloSession(VehicleSession):
     """The protocol between an open driver and its drone. Not thread-safe.
 
-    Args:
-        options: Options of the vehicle's address.
-        now_ns: The time of opening.
-        extra: Returns further telemetry for ``Feedback.native``.
-        video_ns: Returns when usable video or a key frame last arrived; 0 if never.
+    ``extra`` returns further telemetry for ``Feedback.native``, ``video_ns`` when usable video or a key frame last
+    arrived, 0 if never.
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)

@@ -154,14 +154,9 @@ class TelloVideo:
 
     Decoding starts at an intact key frame with a decoder that rejects any damage. If concealment is allowed, a second
     decoder takes over at the first damage and decodes again from that key frame, filling gaps from the previous image.
-    After a damaged key frame, or more damaged images than allowed, nothing is shown until the next intact key frame.
-
-    Args:
-        concealed: Maximum number of damaged images on which a displayed one may depend.
-        on_whole: Called on the decoding thread with each undamaged image that depends only on undamaged ones.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
+    After a damaged key frame, or more than ``concealed`` damaged images, nothing is shown until the next intact key
+    frame. ``on_whole`` is called on the decoding thread with each undamaged image that depends only on undamaged ones.
+    Raises :class:`MissingExtraError` if PyAV is not installed.
     """
 
     def __init__(self, concealed: int = 0, on_whole: Callable[[Coded], None] = lambda _: None) -> None:

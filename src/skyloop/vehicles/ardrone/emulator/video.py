@@ -159,19 +159,11 @@ Ints = NDArray[np.int64]
 def encode(
     picture: NDArray[np.uint8], number: int, *, quant: int = uvlc.TABLE_QUANT, max_bytes: int = MAX_DATAGRAM
 ) -> bytes:
-    """Encode an image as one datagram.
+    """Encode an image (BGR, uint8, shape (height, width, 3), with one of the format's sizes) as one datagram.
 
-    Macroblocks that would be partly outside the image are omitted, as the format requires.
-
-    Args:
-        picture: BGR, uint8, shape (height, width, 3), with one of the format's sizes.
-        number: The picture number.
-        quant: 1 (finest) to 30, or 31, which is like 2 and is the one that real drones use.
-        max_bytes: Maximum size; an image that would need more is quantised more coarsely.
-
-    Raises:
-        UsageError: The size or type is wrong, the number or quantiser is out of range, or the image does not fit even
-            with the coarsest quantiser.
+    Macroblocks that would be partly outside the image are omitted, as the format requires. ``quant`` is 1 (finest) to
+    30, or 31, which is like 2 and is the one that real drones use; an image that would need more than ``max_bytes`` is
+    quantised more coarsely. Raises :class:`UsageError` if an argument is out of range, or the image never fits.
     """
     _check(picture, number, quant)
     height, width = picture.shape[:2]

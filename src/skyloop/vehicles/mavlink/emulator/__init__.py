@@ -199,15 +199,7 @@ _SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
 
 
 class TransportStream:
-    """Encodes and sends each image as it arrives. Not thread-safe.
-
-    Args:
-        host: Host to send to.
-        port: UDP port.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
+    """Encodes and sends each image as it arrives. Not thread-safe. Raises MissingExtraError without PyAV."""
 
     def __init__(self, host: str, port: int) -> None:
         try:

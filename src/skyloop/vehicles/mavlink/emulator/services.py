@@ -54,11 +54,7 @@ def mission_ack(message: Message, result: int) -> Message:
 
 
 class Mission:
-    """A mission stored as in ArduCopter: item 0 is always home, even after an upload.
-
-    Attributes:
-        current: The number of the next item to fly.
-    """
+    """A mission stored as in ArduCopter: item 0 is always home, even after an upload."""
 
     def __init__(self) -> None:
         self.current = 0

@@ -265,9 +265,7 @@ class Betaflight(CoupledFirmware):
     def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
         """Return :func:`connected`, allowing more time after each failure.
 
-        Raises:
-            StartedInVainError: The process does not reply.
-            OSError: The process has ended.
+        Raises StartedInVainError if the process does not reply, and OSError if it has ended.
         """
         try:
             link = connected(self._msp_port, words, answer, self._patience_s)
@@ -335,10 +333,8 @@ class Betaflight(CoupledFirmware):
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
     """Connect to a serial port that opens soon; return once ``words`` get a reply that contains ``answer``.
 
-    Data sent before the port works is lost or ends the connection, so the attempt is repeated.
-
-    Raises:
-        OSError: There was no connection within ``within_s`` [s].
+    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if there
+    was no connection within ``within_s``.
     """
     end_s = time.monotonic() + within_s
     while True:

@@ -31,9 +31,8 @@ class CoupledFirmware(ABC):
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
         """Prepare without starting anything.
 
-        Args:
-            on_event: Called with each event, on the simulation's or the program's thread; must return quickly.
-            folder: Working folder with the firmware's settings; None for a new one that is removed at the end.
+        ``on_event`` is called on the simulation's or the program's thread and must return quickly. ``folder`` is where
+        the firmware keeps its settings; None for a new one that is removed at the end.
         """
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
@@ -110,11 +109,7 @@ class CoupledFirmware(ABC):
         """Write the firmware's startup files and return how to start it. Runs on the program's thread."""
 
     def _verify(self) -> None:  # noqa: B027  most firmware either starts well or ends
-        """Return once its process has started properly. Runs on the program's thread.
-
-        Raises:
-            OSError: The start failed and must be repeated.
-        """
+        """Return once its process has started properly, on the program's thread; raise OSError to repeat the start."""
 
     @abstractmethod
     def _begin(self) -> None:

@@ -73,10 +73,7 @@ class Launch:
 class Program:
     """A firmware process that is restarted whenever it ends, until :meth:`close`.
 
-    Attributes:
-        name: The firmware's name in messages.
-        starts: Number of starts.
-        pid: The process id; 0 while it is not running.
+    ``starts`` counts the starts; ``pid`` is the process id, 0 while it is not running.
     """
 
     def __init__(
@@ -91,15 +88,11 @@ class Program:
     ) -> None:
         """Store the arguments; :meth:`start` starts the process.
 
-        Args:
-            name: The firmware's name in messages.
-            prepare: Called before each start with the working folder; writes the files that the firmware reads there.
-                Raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
-            report: Called with each event, on one of this object's threads.
-            verify: Called once the process is running, before the start is reported; None for no check. Raises
-                ``OSError`` to have it ended and restarted, or :class:`StartedInVainError` to do that at once.
-            folder: Working folder with the firmware's settings; None for a new one that is removed at the end.
-            restart_s: Time from the process's end to its next start [s].
+        ``prepare`` is called before each start with the working folder and writes the files that the firmware reads
+        there; it raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if the firmware can't be started now.
+        ``report`` is called with each event, on one of this object's threads. ``verify`` is called once the process is
+        running, before the start is reported; it raises ``OSError`` to have the process ended and restarted, or
+        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and removed at the end.
         """
         self.name = name
         self.starts = 0
