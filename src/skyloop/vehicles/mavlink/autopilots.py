@@ -14,8 +14,8 @@ from typing import ClassVar, Final, Protocol
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.microservices import VehicleCommand
 from skyloop.vehicles.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error

@@ -12,9 +12,8 @@ from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, ThrustModel
 from skyloop.vehicles.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 # Frames in SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
 WORLD: Final = 1

@@ -16,9 +16,8 @@ from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.options import Peer, PoseMessage
 from skyloop.vehicles.mavlink.telemetry import Telemetry
 from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Autopilot
 
 MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may have moved to another port
 MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number

@@ -46,9 +46,8 @@ from skyloop.vehicles.mavlink.manoeuvres import (
 from skyloop.vehicles.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.vehicles.mavlink.ownership import FlightOwnership
 from skyloop.vehicles.mavlink.telemetry import VehicleState
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))

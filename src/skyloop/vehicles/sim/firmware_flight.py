@@ -34,8 +34,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.sim.rotor_dynamics import rotors_of
 from skyloop.vehicles.sim.firmware import AutopilotKind
-from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import CoupledFirmware, FirmwareEvent, FirmwareEventKind
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 

@@ -15,8 +15,7 @@ import pytest
 from skyloop.errors import UsageError
 from skyloop.vehicles.sim.firmware import coupling
 from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE, ArduCopter
-from skyloop.vehicles.sim.firmware.coupling import STOPPED, WAIT_S
-from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import STOPPED, WAIT_S, FirmwareEventKind
 from tests.vehicles.sim.firmware.rig import COMMANDS, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -16,9 +16,8 @@ import pytest
 from skyloop.errors import UsageError
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.sim.firmware import coupling, px4
-from skyloop.vehicles.sim.firmware.coupling import STOPPED
 from skyloop.vehicles.sim.firmware.ports import bound
-from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import STOPPED, FirmwareEventKind
 from skyloop.vehicles.sim.firmware.px4 import STEP_US, STEPS, VARIABLE, Px4
 from tests.vehicles.sim.firmware.rig import COMMANDS, FIX, Rig, flying, program
 

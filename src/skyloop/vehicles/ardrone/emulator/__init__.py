@@ -34,8 +34,16 @@ from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, ta
 from skyloop.vehicles.ardrone.emulator.video import CAMERAS, DroneClock, PavePacker, UvlcPacker
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE, STANDARD, Ports
-from skyloop.vehicles.emulation.datagrams import Address, DatagramPort, Loop, bound
-from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.emulator import (
+    NO_FAULTS,
+    Address,
+    DatagramPort,
+    Emulator,
+    Loop,
+    RunningEmulator,
+    bound,
+    checked_delay,
+)
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding, require_encoder
 

@@ -29,8 +29,7 @@ from skyloop.faults import Faults
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
-from skyloop.vehicles.emulation.datagrams import Loop
-from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter

@@ -45,10 +45,9 @@ from skyloop.vehicles.mavlink.emulator.services import (
     mission_ack,
 )
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, Message
+from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
-from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
 STICK_TIMEOUT_S: Final = 3.0  #: a remote control over MAVLink counts as lost after this much silence

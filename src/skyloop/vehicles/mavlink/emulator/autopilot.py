@@ -18,9 +18,8 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, Manoeuvres, on_
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable, answers
 from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
 from skyloop.vehicles.mavlink.wire.axes import Vector
-from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
+from skyloop.vehicles.mavlink.wire.codec import Message, ModeFlag, SystemState, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import ModeFlag, SystemState
 
 ACCEPTED: Final = 0
 TEMPORARILY_REJECTED: Final = 1

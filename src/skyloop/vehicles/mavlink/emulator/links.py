@@ -13,7 +13,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort, Loop
+from skyloop.vehicles.emulation.emulator import Address, ByteServer, DatagramPort, Loop
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports

@@ -33,10 +33,9 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
+from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
-from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate if there is no remote control
 STICK_SPEED_M_S: Final = 10.0  #: speed at full stick (MPC_VEL_MANUAL)

@@ -13,9 +13,8 @@ from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.vehicles.emulation.flight import FlightControl
 from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, geodetic
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 PREARM: Final = 0x10000000
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER

@@ -47,10 +47,16 @@ from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
-from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
+from skyloop.vehicles.sim.firmware.program import (
+    Commands,
+    CoupledFirmware,
+    FirmwareEvent,
+    Launch,
+    StartedInVainError,
+    find_program,
+)
 
 MOTORS_PORT: Final = 9002
 STATE_PORT: Final = 9003

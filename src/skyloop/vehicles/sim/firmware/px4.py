@@ -23,9 +23,8 @@ from skyloop.messages.geometry import in_16_bits
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, GpsFix, Readings, geodetic
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
-from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, find_program
+from skyloop.vehicles.sim.firmware.program import Commands, CoupledFirmware, FirmwareEvent, Launch, find_program
 
 VARIABLE: Final = "SKYLOOP_PX4"
 WHERE: Final = (
