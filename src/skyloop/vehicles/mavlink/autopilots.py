@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.microservices import VehicleCommand
@@ -25,47 +25,27 @@ LEAST_THRUST: Final = 0.1  #: lower limit of the thrust field
 MOST_THRUST: Final = 0.9  #: upper limit of the thrust field
 
 
-class ThrustModel(Protocol):
-    """Computes the thrust field of ``SET_ATTITUDE_TARGET`` from a climb rate, for one flight by attitude.
-
-    ArduCopter interprets the field as a climb rate: 0.5 holds the altitude. PX4 interprets it as collective thrust, so
-    we hold the altitude with a proportional-integral loop on the climb rate, whose integral is an altitude error.
-    """
-
-    def limit_climb(self, climb_m_s: float) -> float:
-        """Return the climb rate limited to what the autopilot accepts, positive up [m/s]."""
-
-    def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
-        """Return the thrust field, 0 to 1.
-
-        Args:
-            climb_m_s: Requested climb rate, positive up.
-            climbing_m_s: Measured climb rate, if known.
-            tilt_rad: Requested tilt.
-            step_s: Time since the last call.
-        """
-
-
 class ClimbRateThrust:
-    """Thrust field for ArduCopter: a fraction of its maximum climb or descent rate."""
+    """Thrust field of ``SET_ATTITUDE_TARGET`` for ArduCopter: a fraction of its maximum climb or descent rate."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s
 
     def limit_climb(self, climb_m_s: float) -> float:
-        """See :meth:`ThrustModel.limit_climb`."""
+        """Return the climb rate limited to what the autopilot accepts, positive up [m/s]."""
         return max(-self._down, min(self._up, climb_m_s))
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:  # noqa: ARG002
-        """See :meth:`ThrustModel.thrust`."""
+        """Return the thrust field, 0 to 1, for a requested climb rate, positive up; 0.5 holds the altitude."""
         climb = self.limit_climb(climb_m_s)
         return 0.5 + 0.5 * climb / (self._up if climb > 0 else self._down)
 
 
 class CollectiveThrust:
-    """Thrust field for PX4: collective thrust, computed by a loop that holds the climb rate.
+    """The same field for PX4: collective thrust.
 
-    An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
+    A proportional-integral loop, whose integral is an altitude error, holds the climb rate during one flight by
+    attitude. An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -73,11 +53,11 @@ class CollectiveThrust:
         self._error_m = 0.0
 
     def limit_climb(self, climb_m_s: float) -> float:
-        """See :meth:`ThrustModel.limit_climb`."""
+        """Return the climb rate, which PX4 does not limit."""
         return climb_m_s
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
-        """See :meth:`ThrustModel.thrust`."""
+        """Return the thrust field, 0 to 1, for a requested climb rate, positive up, the measured one, and a tilt."""
         error = climb_m_s - climbing_m_s if climbing_m_s is not None else 0.0
         self._error_m += error * step_s
         self._error_m = max(-MOST_ALTITUDE_ERROR_M, min(MOST_ALTITUDE_ERROR_M, self._error_m))
@@ -86,6 +66,7 @@ class CollectiveThrust:
         return max(LEAST_THRUST, min(MOST_THRUST, thrust))
 
 
+ThrustModel = ClimbRateThrust | CollectiveThrust
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 REACHED_M: Final = 0.2  #: a take-off counts as complete this far below its target altitude
 EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position

@@ -62,13 +62,6 @@ _OVERRIDDEN: Final = 8  #: number of channels that an override can set
 _IGNORED: Final = 0xFFFF  #: value for a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
-_WORDS: Final = {
-    "armed": "Arming motors",
-    "disarmed": "Disarming motors",
-    "auto_disarm": "Disarming motors",
-    "landed": "Disarming motors",
-    "forced": "Disarming motors",
-}
 
 
 class ArduCopter(Autopilot):
@@ -85,6 +78,10 @@ class ArduCopter(Autopilot):
     NOTHING_TO_TELL = FAILED
     BYTEWISE = False
     DISARM_S = 10.2
+    WORDS: ClassVar[dict[str, str]] = {
+        "armed": "Arming motors",
+        **dict.fromkeys(("disarmed", "auto_disarm", "landed"), "Disarming motors"),
+    }
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
@@ -114,9 +111,6 @@ class ArduCopter(Autopilot):
 
     def _counts(self, heartbeat: Message) -> bool:
         return bool(heartbeat.get_srcSystem() == round(self.parameters["MAV_GCS_SYSID"]))
-
-    def _words(self, occasion: str) -> str:
-        return _WORDS[occasion]
 
     # Modes -----------------------------------------------------------------------------------------------------
 

@@ -43,13 +43,6 @@ STICK_EXPO: Final = 0.6  #: how much a stick's response is flattened near its ce
 STICK_FILTER_S: Final = 0.1  #: time constant of the filter for a stick's speed
 LIFTS_OFF_AT: Final = 0.2  #: throttle at which it lifts off, as a fraction of the stick's travel upwards
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
-_WORDS: Final = {
-    "armed": "Armed by external command",
-    "disarmed": "Disarmed by external command",
-    "auto_disarm": "Disarmed by auto preflight disarming",
-    "landed": "Disarmed by landing",
-    "forced": "Disarmed by external command",
-}
 
 
 class Px4(Autopilot):
@@ -85,6 +78,12 @@ class Px4(Autopilot):
     BYTEWISE = True
     DISARM_S = 11.1
     REPORTS_PREARM = False
+    WORDS: ClassVar[dict[str, str]] = {
+        "armed": "Armed by external command",
+        "disarmed": "Disarmed by external command",
+        "auto_disarm": "Disarmed by auto preflight disarming",
+        "landed": "Disarmed by landing",
+    }
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
@@ -114,9 +113,6 @@ class Px4(Autopilot):
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
         return True
-
-    def _words(self, occasion: str) -> str:
-        return _WORDS[occasion]
 
     @property
     def _fresh(self) -> bool:
