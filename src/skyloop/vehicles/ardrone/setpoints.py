@@ -17,13 +17,12 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,
     Attitude,
     EmergencyStop,
-    EventKind,
     Hover,
     Idle,
     Land,
@@ -260,9 +259,7 @@ class SetpointController:
             if not self._warned_blind:
                 self._warned_blind = True
                 text = "the drone's limits are not known yet: it hovers instead of following set-points"
-                self._events.append(
-                    VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "limits_unknown"})
-                )
+                self._events.append(message(text, "limits_unknown", Severity.WARNING))
             return Hover()
         stick, applied = stick_of(action, self.limits)
         self._remain(stick)
@@ -375,9 +372,7 @@ class SetpointController:
                 return Ref.TAKEOFF
             self._decision = Decision.STAY
             text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"
-            self._events.append(
-                VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "no_takeoff"})
-            )
+            self._events.append(message(text, "no_takeoff", Severity.WARNING))
         if self._decision is Decision.LAND:
             return Ref(0)
         if self.condition is None:
