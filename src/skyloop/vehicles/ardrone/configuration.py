@@ -87,11 +87,9 @@ class Configurator:
 
     @property
     def busy(self) -> bool:
-        """Whether an exchange is running or waiting."""
         return self._exchange is not None or bool(self._queue)
 
     def submit(self, exchange: Exchange) -> None:
-        """Queue an exchange."""
         self._queue.append(exchange)
         if self._exchange is None:
             self._next_exchange()

@@ -159,12 +159,10 @@ class PaveStream:
 
     @property
     def broken(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.broken
 
     @property
     def lost_bytes(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
@@ -183,7 +181,6 @@ class PaveStream:
         return frames
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()
 
 
@@ -226,7 +223,6 @@ class DatagramStream:
         return []
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
@@ -259,16 +255,13 @@ class PaveVideo:
 
     @property
     def waited(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         return self._decoder.waited
 
     @property
     def damaged(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         return self._decoder.damaged
 
     def restart(self) -> None:
-        """Wait for the next key frame."""
         self._decoder.restart()
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
@@ -352,7 +345,6 @@ class EncodedStream:
     def __init__(
         self, sink: Sink, camera: Callable[[], str], intrinsics: Callable[[int, int], Intrinsics | None]
     ) -> None:
-        """Store the arguments."""
         self._camera = camera
         self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
@@ -390,7 +382,6 @@ class VideoReceiver(LiveVideo):
         came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store the arguments. No I/O."""
         if version not in (1, 2):
             raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
 

@@ -51,7 +51,6 @@ class Loop:
         self.watch(self._wakened, self._empty)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -84,7 +83,6 @@ class Loop:
             self._selector.register(sock, events, (readable, writable))
 
     def forget(self, sock: socket.socket) -> None:
-        """Stop watching a socket."""
         with suppress(KeyError, ValueError):
             self._selector.unregister(sock)
 
@@ -152,7 +150,6 @@ class DatagramPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was given."""
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
@@ -161,7 +158,6 @@ class DatagramPort:
             self._later(partial(self._send, each, to))
 
     def close(self) -> None:
-        """Close the port."""
         self._loop.forget(self._socket)
         self._socket.close()
 
@@ -229,7 +225,6 @@ class ByteServer:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was given."""
         return int(self._server.getsockname()[1])
 
     def send(self, data: bytes) -> None:
@@ -245,7 +240,6 @@ class ByteServer:
             raise
 
     def close(self) -> None:
-        """Close the server and the connection."""
         self._loop.forget(self._server)
         self._server.close()
         if self._client is not None:
@@ -253,7 +247,6 @@ class ByteServer:
             self._client.close()
 
     def drop(self) -> None:
-        """Close the client's connection."""
         if self._client is not None:
             self._loop.forget(self._client)
             self._client.close()

@@ -47,7 +47,6 @@ class OneCamera:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """See :class:`VideoSettings`."""
         return (self.camera,)
 
     @property
@@ -105,11 +104,9 @@ class VideoEncoding(Generic[S]):
         self.status = NOTHING_SENT
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread and wait for it."""
         with self._changed:
             self._stopping = True
             self._changed.notify()

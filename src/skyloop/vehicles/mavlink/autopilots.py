@@ -185,11 +185,9 @@ class ArduCopterProfile(AutopilotProfile):
     )
 
     def mode_of(self, custom_mode: int) -> str:
-        """Return the mode's name."""
         return copter_mode(custom_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
-        """Return the command that changes the mode."""
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(COPTER_NUMBERS[mode])))
 
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:  # noqa: ARG002
@@ -278,11 +276,9 @@ class Px4Profile(AutopilotProfile):
     )
 
     def mode_of(self, custom_mode: int) -> str:
-        """Return the mode's name."""
         return px4_mode(custom_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
-        """Return the command that changes the mode."""
         main, sub = PX4_NUMBERS[mode]
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(main), float(sub)))
 

@@ -41,7 +41,6 @@ class UdpListener:
             raise
 
     def fileno(self) -> int:
-        """Return the file descriptor."""
         return self._socket.fileno()
 
     def receive(self) -> list[tuple[bytes, Peer]]:
@@ -68,7 +67,6 @@ class UdpListener:
             self.dropped += 1
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
     def _to_socket(self, peer: tuple[str, int]) -> tuple[str, int] | tuple[str, int, int, int]:

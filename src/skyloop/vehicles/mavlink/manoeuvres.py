@@ -62,7 +62,6 @@ class PositionHold:
         self._position: Vector | None = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due."""
         slow = vehicle.velocity is not None and math.hypot(*vehicle.velocity) < STOPPED_M_S
         late = seconds(now_ns - self._begun_ns) > STOPPING_S
         if self._position is None and vehicle.position is not None and (slow or late):
@@ -81,7 +80,6 @@ class VelocitySetpoint:
         self.action = action
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:  # noqa: ARG002
-        """Return the set-point if one is due."""
         return velocity_message(self.action, target)
 
 
@@ -168,7 +166,6 @@ class AttitudeSetpoint:
         return Attitude(action.roll, action.pitch, self._thrust.limit_climb(action.climb), action.yaw_rate)
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due."""
         action = self.action
         step_s = 0.0 if self._before_ns is None else min(MOST_STEP_S, seconds(now_ns - self._before_ns))
         self._before_ns = now_ns

@@ -78,7 +78,6 @@ class ParameterExchange:
 
     @property
     def values(self) -> dict[str, float]:
-        """All values by the autopilot's own names."""
         return {name: held.value for name, held in self.reported.items()}
 
     @property
@@ -87,7 +86,6 @@ class ParameterExchange:
         return bool(self._writes) or (self._wanted and not self.complete and not self.given_up)
 
     def on_value(self, message: Message, now_ns: int) -> None:
-        """Handle a ``PARAM_VALUE``."""
         name, kind = message.param_id, message.param_type
         try:
             value = from_field(message.param_value, kind, bytewise=self.bytewise)

@@ -308,7 +308,6 @@ class SetpointController:
     # Messages ----------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 

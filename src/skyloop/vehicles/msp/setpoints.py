@@ -346,7 +346,6 @@ class SetpointController:
     # Sticks --------------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 

@@ -528,7 +528,6 @@ class StepPlayer:
             self._sink.link(LinkState.CLOSED, f"end of the recording after {self.publisher.frames} frames")
 
     def close(self) -> None:
-        """Close the file."""
         close: Callable[[], None] | None = getattr(self._samples, "close", None)
         if close is not None:
             close()

@@ -60,11 +60,9 @@ class Conversation:
 
     @property
     def idle(self) -> bool:
-        """Whether no request is in flight or queued."""
         return self._asked is None and not self._queue
 
     def ask(self, request: Request) -> None:
-        """Queue a request."""
         self._queue.append(request)
 
     def moved(self, text: str, now_ns: int) -> None:

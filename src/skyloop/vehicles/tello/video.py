@@ -106,12 +106,10 @@ class VideoStream:
 
     @property
     def broken(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.missing
 
     @property
     def lost_bytes(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.stray
 
     def read(self) -> list[Coded]:
@@ -124,7 +122,6 @@ class VideoStream:
         return frames
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
     def _drain(self, frames: list[Coded]) -> None:
@@ -173,7 +170,6 @@ class TelloVideo:
         self._number = 0
 
     def restart(self) -> None:
-        """Wait for the next key frame."""
         self._strict = self._patching = None
 
     @property
@@ -182,7 +178,6 @@ class TelloVideo:
         return self._strict is None and self._patching is None
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         unit = coded.data
         if not isinstance(unit, AccessUnit):
             raise TypeError("expected a picture of a Tello")

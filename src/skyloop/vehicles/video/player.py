@@ -119,7 +119,6 @@ class ContainerSource:
             self.stream = H264
 
     def images(self) -> Iterator[DecodedImage]:
-        """See :meth:`Source.images`."""
         stamp_s = -1.0 / self.fps
         coded: dict[int | None, tuple[int, Unit | None]] = {}  # keyed by stamp, because decoders delay images
         for number, packet in enumerate(self._packets()):
@@ -146,7 +145,6 @@ class ContainerSource:
             self.damaged += 1  # a truncated file, in which everything before the cut is usable
 
     def close(self) -> None:
-        """Close the file."""
         self._container.close()
 
     def _error(self, what: str, error: Exception) -> Exception:
@@ -198,7 +196,6 @@ class PaveSource:
                 yield DecodedImage(frame.timestamp_ms / 1000.0, image, unit, frame.number)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def _parser_frames(self) -> Iterator[PaveFrame]:

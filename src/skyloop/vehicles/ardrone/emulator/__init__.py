@@ -156,7 +156,6 @@ class Outlet:
         self._skipping = True
 
     def close(self) -> None:
-        """Close the connection."""
         self._loop.forget(self._socket)
         self._socket.close()
 
@@ -203,7 +202,6 @@ class StreamPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was given."""
         return int(self._socket.getsockname()[1])
 
     def accept(self) -> None:
@@ -222,12 +220,10 @@ class StreamPort:
                 self._joined(outlet)
 
     def broadcast(self, piece: bytes, *, starts: bool = True) -> None:
-        """Send a piece to all clients."""
         for outlet in self.outlets:
             outlet.offer(piece, starts=starts)
 
     def close(self) -> None:
-        """Close the port and all connections."""
         self._loop.forget(self._socket)
         self._socket.close()
         for outlet in self.outlets:
@@ -359,7 +355,6 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def _seen(self) -> bool:
-        """Whether any client is receiving video."""
         if self._video_stream is not None:
             return bool(self._video_stream.outlets)
         return bool(self._video_clients)

@@ -78,12 +78,10 @@ class VideoSettings:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _CAMERAS[self.channel]
 
     @property
     def inset(self) -> tuple[int, int]:
-        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _INSETS.get(self.channel, (0, 0))
 
 

@@ -138,7 +138,6 @@ class UvlcPacker:
         self._number = 0
 
     def pack(self, picture: NDArray[np.uint8], _settings: VideoSettings, _captured_ns: int) -> Piece | None:
-        """Encode an image."""
         self._number += 1
         return Piece(encode(picture, self._number & 0xFFFFFFFF), starts=True)
 

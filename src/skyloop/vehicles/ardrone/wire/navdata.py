@@ -107,7 +107,6 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Number of bytes, excluding tag and size."""
         return self._struct.size
 
     def unpack(self, data: bytes | memoryview, at: int) -> Any:

@@ -230,7 +230,6 @@ class TransportStream:
             self._container.mux(packet)
 
     def close(self) -> None:
-        """Close the stream."""
         self._container.close()
 
 

@@ -106,7 +106,6 @@ class ArduCopter(Autopilot):
 
     @property
     def custom_mode(self) -> int:
-        """The mode's number."""
         return COPTER_NUMBERS[self.mode]
 
     def _counts(self, heartbeat: Message) -> bool:

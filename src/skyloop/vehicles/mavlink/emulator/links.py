@@ -199,16 +199,13 @@ class UdpPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
         return self._port.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the peer."""
         if self._settings.carries(message):
             self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
 
     def close(self) -> None:
-        """Close the port."""
         self._port.close()
 
     def _receive(self, datagram: bytes, sender: Address) -> None:
@@ -236,16 +233,13 @@ class TcpPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the client, if any."""
         if self._settings.carries(message):
             self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:
-        """Close the server and the connection."""
         self._server.close()
 
     def _begin(self) -> None:

@@ -103,7 +103,6 @@ class Px4(Autopilot):
 
     @property
     def custom_mode(self) -> int:
-        """The mode's number."""
         return px4_custom(self.mode)
 
     @property

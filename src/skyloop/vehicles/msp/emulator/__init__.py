@@ -467,7 +467,6 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def _receive(self, data: bytes) -> None:

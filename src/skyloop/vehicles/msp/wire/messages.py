@@ -187,7 +187,6 @@ class Attitude:
         return cls(roll / 10, pitch / 10, float(heading))
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _ATTITUDE.pack(round(self.roll_deg * 10), round(self.pitch_deg * 10), round(self.heading_deg) % 360)
 
 
@@ -208,7 +207,6 @@ class Altitude:
         return cls(height / 100, climb / 100)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _ALTITUDE.pack(round(self.height_m * 100), in_16_bits(self.climb_m_s * 100))
 
 
@@ -294,7 +292,6 @@ class Gps:
         return cls(bool(fix), satellites, latitude / 1e7, longitude / 1e7, altitude, speed / 100, course / 10)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         place = round(self.latitude_deg * 1e7), round(self.longitude_deg * 1e7), round(self.altitude_m)
         speed, course = round(self.speed_m_s * 100), round(self.course_deg * 10) % 3600
         return _GPS.pack(int(self.fix) * 2, self.satellites, *place, speed, course)
@@ -318,7 +315,6 @@ class Imu:
         return cls((a, b, c), (d, e, f), (g, h, i))
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _IMU.pack(*self.acceleration, *self.gyro_deg_s, *self.magnetic)
 
 
@@ -402,7 +398,6 @@ class FailsafeConfig:
         return cls(delay / 10, float(landing), throttle, low / 10, procedure)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         delay, low = round(self.delay_s * 10), round(self.low_throttle_s * 10)
         return _FAILSAFE.pack(delay, round(self.landing_s), self.throttle_us, 0, low, self.procedure)
 
@@ -445,7 +440,6 @@ class RxConfig:
         return cls(low, middle, high, least, most)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _RX.pack(0, self.high_us, self.middle_us, self.low_us, 0, self.least_us, self.most_us)
 
 

@@ -109,7 +109,6 @@ class Program:
 
     @property
     def running(self) -> bool:
-        """Whether the process is running."""
         return self.pid != 0
 
     def start(self) -> None:
@@ -278,7 +277,6 @@ class CoupledFirmware(ABC):
         self._close()
 
     def exchange(self, readings: Readings) -> Commands | None:
-        """See :meth:`~skyloop.sim.instruments.Firmware.exchange`."""
         if not self.program.running:
             return STOPPED
         if self.program.starts != self._starts:
