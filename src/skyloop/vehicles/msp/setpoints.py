@@ -35,7 +35,7 @@ ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has no
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
 #: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
 PASSING: Final = frozenset(
-    {
+    (
         "RXLOSS",
         "FAILSAFE",
         "NOT_DISARMED",
@@ -45,7 +45,7 @@ PASSING: Final = frozenset(
         "RC_LINK",
         "SENSORS_CALIBRATING",
         ARM_SWITCH,
-    }
+    )
 )
 SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: more of them, in its first reports before it has an attitude
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] at a lift-off, by precision
