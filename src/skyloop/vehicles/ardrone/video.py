@@ -147,23 +147,15 @@ WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1; any small datagr
 _CHUNK: Final = 1 << 16
 
 
-class PaveStream:
+class PaveStream(PaveAssembly):
     """A connection to an AR.Drone 2: PaVE over TCP."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
+        super().__init__(connection)
         self._clock = clock
-        self._assembly = PaveAssembly(connection)
         self._received_ns = clock()
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.settimeout(POLL_S)
-
-    @property
-    def broken(self) -> int:
-        return self._assembly.broken
-
-    @property
-    def lost_bytes(self) -> int:
-        return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
         """Return the frames that arrive within :data:`POLL_S`."""
@@ -173,9 +165,9 @@ class PaveStream:
             frames = []
         else:
             if not data:
-                self._assembly.end()
+                self.end()
                 raise ConnectionError("the drone ended the stream")
-            frames = self._assembly.feed(data, self._clock())
+            frames = self.feed(data, self._clock())
         self._received_ns = self._clock() if frames else self._received_ns
         _give_up_if_silent(self._clock() - self._received_ns)
         return frames

@@ -52,6 +52,20 @@ class Function(IntEnum):
     INAV_ANALOG = 0x2002
 
 
+# Layouts of payloads, or of those parts of them that every version has.
+_STATUS: Final = struct.Struct("<HHHIBHBB")
+_INAV_STATUS: Final = struct.Struct("<HHHHBI")
+_ATTITUDE: Final = struct.Struct("<hhh")
+_ALTITUDE: Final = struct.Struct("<ih")
+_BATTERY: Final = struct.Struct("<BHBHhB")
+_ANALOG: Final = struct.Struct("<BHHh")
+_INAV_ANALOG: Final = struct.Struct("<BHhIIIIB")
+_GPS: Final = struct.Struct("<BBiihHH")
+_IMU: Final = struct.Struct("<9h")
+_FAILSAFE: Final = struct.Struct("<BBHBHB")
+_RX: Final = struct.Struct("<BHHHBHH")
+
+
 def _unpack(form: struct.Struct, payload: bytes, what: str) -> tuple[int, ...]:
     if len(payload) < form.size:
         raise DecodeError(f"{what} of {len(payload)} bytes: at least {form.size} expected")
@@ -168,10 +182,6 @@ class Status:
         return made + struct.pack("<BIBHB", self.count, self.flags or 0, 0, 0, 4)
 
 
-_STATUS: Final = struct.Struct("<HHHIBHBB")
-_INAV_STATUS: Final = struct.Struct("<HHHHBI")
-
-
 @dataclass(frozen=True, slots=True)
 class Attitude:
     """Roll (positive right side down), pitch (positive nose down) and heading (clockwise from north) [degrees]."""
@@ -190,9 +200,6 @@ class Attitude:
         return _ATTITUDE.pack(round(self.roll_deg * 10), round(self.pitch_deg * 10), round(self.heading_deg) % 360)
 
 
-_ATTITUDE: Final = struct.Struct("<hhh")
-
-
 @dataclass(frozen=True, slots=True)
 class Altitude:
     """Height above the place where it was armed [m], and climb [m/s]."""
@@ -208,9 +215,6 @@ class Altitude:
 
     def encode(self) -> bytes:
         return _ALTITUDE.pack(round(self.height_m * 100), in_16_bits(self.climb_m_s * 100))
-
-
-_ALTITUDE: Final = struct.Struct("<ih")
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,11 +258,6 @@ class Battery:
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
 
-_BATTERY: Final = struct.Struct("<BHBHhB")
-_ANALOG: Final = struct.Struct("<BHHh")
-_INAV_ANALOG: Final = struct.Struct("<BHhIIIIB")
-
-
 @dataclass(frozen=True, slots=True)
 class CellVoltages:
     """Voltages of an empty and a full cell [V]."""
@@ -297,9 +296,6 @@ class Gps:
         return _GPS.pack(int(self.fix) * 2, self.satellites, *place, speed, course)
 
 
-_GPS: Final = struct.Struct("<BBiihHH")
-
-
 @dataclass(frozen=True, slots=True)
 class Imu:
     """Raw sensor values. Only those of the gyroscope have the same unit on every board: degrees per second."""
@@ -316,9 +312,6 @@ class Imu:
 
     def encode(self) -> bytes:
         return _IMU.pack(*self.acceleration, *self.gyro_deg_s, *self.magnetic)
-
-
-_IMU: Final = struct.Struct("<9h")
 
 
 # Sticks --------------------------------------------------------------------------------------------------------------
@@ -402,9 +395,6 @@ class FailsafeConfig:
         return _FAILSAFE.pack(delay, round(self.landing_s), self.throttle_us, 0, low, self.procedure)
 
 
-_FAILSAFE: Final = struct.Struct("<BBHBHB")
-
-
 class OnLoss(IntEnum):
     """The value that a channel takes 0.3 s after the receiver fell silent."""
 
@@ -442,8 +432,6 @@ class RxConfig:
     def encode(self) -> bytes:
         return _RX.pack(0, self.high_us, self.middle_us, self.low_us, 0, self.least_us, self.most_us)
 
-
-_RX: Final = struct.Struct("<BHHHBHH")
 
 RX_MSP: Final = 1 << 14  #: bit in Betaflight's features: sticks are received over MSP
 USUAL_MAP: Final = (0, 1, 3, 2)  #: positions of roll, pitch, yaw and throttle in ``SET_RAW_RC`` (AETR)
