@@ -300,26 +300,21 @@ Samples = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UvlcPicture:
-    """One picture from the drone's camera."""
-
-    number: int  #: the drone's picture count, 32 bits
-    type: PictureType
-    quant: int  #: quantiser given in the picture's header
-    width: int  #: width of the coded part [px]
-    height: int
-    pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-
-
-@dataclass(frozen=True, slots=True)
 class UvlcHeader:
     """The fields of a picture before its first macroblock."""
 
-    number: int
+    number: int  #: the drone's picture count, 32 bits
     type: PictureType
-    quant: int
+    quant: int  #: quantiser in the picture's header
     width: int  #: width of the coded part [px]
     height: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UvlcPicture(UvlcHeader):
+    """One picture from the drone's camera."""
+
+    pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
 
 
 def is_p264(packet: bytes | bytearray | memoryview) -> bool:

@@ -77,7 +77,7 @@ class RunningFirmware(RunningEmulator):
             if settings.video is not None:
                 stream = TransportStream(*settings.video)
                 self._open.append(stream)
-                self._video = encoding(stream)
+                self._video = VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)
                 self._video.start()
             host.attach(drone, self, self, [CAMERA] if self._video is not None else [])
         except BaseException:
@@ -231,8 +231,3 @@ class TransportStream:
 
     def close(self) -> None:
         self._container.close()
-
-
-def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
-    """Return the thread that encodes the newest image, not started yet."""
-    return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)
