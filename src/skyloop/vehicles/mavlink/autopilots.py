@@ -184,8 +184,7 @@ class ArduCopterProfile(AutopilotProfile):
         _SafetyNet("FENCE_ENABLE", "fence", _on, "it has none of its own", 1),
     )
 
-    def mode_of(self, custom_mode: int) -> str:
-        return copter_mode(custom_mode)
+    mode_of = staticmethod(copter_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(COPTER_NUMBERS[mode])))
@@ -275,8 +274,7 @@ class Px4Profile(AutopilotProfile):
         _SafetyNet("GF_MAX_VER_DIST", "ceiling", lambda height: height > 0, "it has none of its own", 30, "m"),
     )
 
-    def mode_of(self, custom_mode: int) -> str:
-        return px4_mode(custom_mode)
+    mode_of = staticmethod(px4_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
         main, sub = PX4_NUMBERS[mode]

@@ -54,8 +54,6 @@ class MavlinkDriver(Driver):
             description=f"a MAVLink vehicle on {self.options.address}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         if self.options.camera is not None:
             self._camera = camera_receiver(self.uri, self.options.camera, sink)
@@ -74,8 +72,6 @@ class MavlinkDriver(Driver):
 
     def _camera_telemetry(self) -> dict[str, Value]:
         return {} if self._camera is None else self._camera.telemetry()
-
-    # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
         return self._opened().command(action)
@@ -124,8 +120,6 @@ class MavlinkDriver(Driver):
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
         return self._link
-
-    # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
         """Return the driver's own limits, plus the autopilot's parameters once they have been read."""

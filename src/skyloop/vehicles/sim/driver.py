@@ -109,8 +109,6 @@ class SimDriver(Driver):
             description=f"a simulated drone in the world {self.options.world!r}, seed {self.options.seed}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         host = self.host if self._shared else SimHost(self.options)
         assert host is not None
@@ -142,8 +140,6 @@ class SimDriver(Driver):
         if self._setpoints is None:
             return limits
         return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
-
-    # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
         if self._firmware is not None:
@@ -186,8 +182,6 @@ class SimDriver(Driver):
         if self._setpoints is not None:
             return self._setpoints.command(action)
         return host.simulation.command(self.drone, action)
-
-    # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
         """Return limits, cameras, battery, wind, the radio link, the room and the objects in it."""
