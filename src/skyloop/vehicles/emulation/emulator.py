@@ -24,7 +24,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.faults import FaultInjector, Faults
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.reports import Occurrence
+from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.vehicles.emulation.video import VideoEncoding
 
 _LONGEST_WAIT_S: Final = 1.0
@@ -315,6 +315,9 @@ class RunningEmulator(ABC):
     def _tick(self, report: Report) -> None:
         """Handle a new report. Runs on the loop's thread."""
 
+    def _crashed(self, text: str) -> None:
+        """Handle a crash; by default its effect appears only in the drone's own data. Runs on the loop's thread."""
+
     def _handle_report(self) -> None:
         self._posted = False
         if self._report is not None:
@@ -330,8 +333,10 @@ class RunningEmulator(ABC):
             self._loop.post(self._handle_report)
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Log an event such as a collision; its effect appears in the drone's own data."""
+        """Log an event such as a collision; a crash has also stopped the motors."""
         _log.info("drone %d: %s", occurrence.drone, occurrence.text)
+        if occurrence.kind is OccurrenceKind.EMERGENCY:
+            self._loop.post(partial(self._crashed, occurrence.text))
 
     def wanted_fps(self, camera: str) -> float:
         """Return the frame rate to render this camera at: its full rate or 0."""

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,7 +27,6 @@ from skyloop.errors import MissingExtraError, UsageError
 from skyloop.faults import Faults
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
@@ -90,13 +88,8 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.autopilot.tick(report)
 
-    # Called by the host, on its threads ------------------------------------------------------------------------
-
-    def happened(self, occurrence: Occurrence) -> None:
-        """Tell the autopilot about a crash, which has stopped the motors."""
-        super().happened(occurrence)
-        if occurrence.kind is OccurrenceKind.EMERGENCY:
-            self._loop.post(partial(self.autopilot.crashed, occurrence.text))
+    def _crashed(self, text: str) -> None:
+        self.autopilot.crashed(text)
 
 
 BOOT_S: Final = 2.0

@@ -27,7 +27,6 @@ from skyloop.messages.feedback import EarthOrigin
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.vehicles.emulation.emulator import ByteServer, Emulator, Loop, RunningEmulator
 from skyloop.vehicles.emulation.flight import FlightControl, SimulatedVehicle, Vehicle
 from skyloop.vehicles.msp.wire import messages as msp
@@ -457,13 +456,8 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.board.tick(report, monotonic_ns())
 
-    # Called by the host, on its threads --------------------------------------------------------------------------
-
-    def happened(self, occurrence: Occurrence) -> None:
-        """Disarm after a crash."""
-        super().happened(occurrence)
-        if occurrence.kind is OccurrenceKind.EMERGENCY:
-            self._loop.post(self.board.crashed)
+    def _crashed(self, text: str) -> None:  # noqa: ARG002  its reason does not matter
+        self.board.crashed()
 
 
 class BetaflightFirmware(Emulator[RunningFirmware]):
