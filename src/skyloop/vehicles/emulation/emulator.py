@@ -315,7 +315,7 @@ class RunningEmulator(ABC):
     def _tick(self, report: Report) -> None:
         """Handle a new report. Runs on the loop's thread."""
 
-    def _crashed(self, text: str) -> None:
+    def _crashed(self, text: str) -> None:  # noqa: B027
         """Handle a crash; by default its effect appears only in the drone's own data. Runs on the loop's thread."""
 
     def _handle_report(self) -> None:
