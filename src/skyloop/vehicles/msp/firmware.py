@@ -28,19 +28,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     rate_curve,
     share_of,
 )
-from skyloop.vehicles.msp.wire.messages import (
-    BETAFLIGHT,
-    INAV,
-    RX_MSP,
-    USUAL_MAP,
-    CellVoltages,
-    FailsafeConfig,
-    Function,
-    Identity,
-    ModeRange,
-    OnLoss,
-    RxConfig,
-)
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Identity, ModeRange
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
@@ -66,15 +54,15 @@ class Setup:
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
     sticks_known: bool = False  #: whether those positions were reported and are not a guess
-    rx: RxConfig = field(default_factory=RxConfig)
-    failsafe: FailsafeConfig | None = None
+    rx: msp.RxConfig = field(default_factory=msp.RxConfig)
+    failsafe: msp.FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
     features: int | None = None
     rates: Rates | None = None
     inav_yaw_rate_deg_s: float | None = None
     inav_expo: tuple[int, int] = (0, 0)  #: INAV's expo for roll and pitch, and for yaw
     angle_limit_deg: float | None = None
-    cells: CellVoltages = field(default_factory=CellVoltages)
+    cells: msp.CellVoltages = field(default_factory=msp.CellVoltages)
     receiver_is_msp: bool | None = None  #: whether MSP is the receiver; reported only by INAV
 
     # Modes -------------------------------------------------------------------------------------------------------
@@ -203,7 +191,7 @@ class Setup:
     def _receiver(self, override: bool) -> list[Diagnostic]:
         is_msp = self.receiver_is_msp
         if self.identity.variant == BETAFLIGHT and self.features is not None:
-            is_msp = bool(self.features & RX_MSP)
+            is_msp = bool(self.features & msp.RX_MSP)
         if is_msp is None:
             return []
         if override:
@@ -246,7 +234,7 @@ class Setup:
         held = [
             name
             for name, (mode, _) in zip(("roll", "pitch", "yaw", "throttle"), self.on_loss, strict=False)
-            if mode == OnLoss.HOLD
+            if mode == msp.OnLoss.HOLD
         ]
         if held:
             detail = f"without sticks it holds the last {', '.join(held)}: it would fly on"
@@ -295,8 +283,8 @@ class Identification:
         ask(Function.BOXNAMES, _box_names, "names of its modes")
         ask(Function.MODE_RANGES, lambda _, data: {"ranges": tuple(msp.mode_ranges(data))}, "switches of its modes")
         ask(Function.RX_MAP, lambda _, data: {"sticks": msp.rx_map(data), "sticks_known": True}, "order of its sticks")
-        ask(Function.RX_CONFIG, lambda _, data: {"rx": RxConfig.decode(data)})
-        ask(Function.FAILSAFE_CONFIG, lambda _, data: {"failsafe": FailsafeConfig.decode(data)})
+        ask(Function.RX_CONFIG, lambda _, data: {"rx": msp.RxConfig.decode(data)})
+        ask(Function.FAILSAFE_CONFIG, lambda _, data: {"failsafe": msp.FailsafeConfig.decode(data)})
         ask(Function.RC_TUNING, _tuning)
         if self.setup.identity.variant == BETAFLIGHT:
             ask(Function.FEATURE_CONFIG, lambda _, data: {"features": msp.features(data)})
@@ -329,7 +317,7 @@ class Identification:
             self.setup = replace(self.setup, angle_limit_deg=int.from_bytes(payload[:2], "little") / 10)
         elif payload is not None:
             with suppress(DecodeError):
-                self.setup = replace(self.setup, cells=CellVoltages.decode(payload))
+                self.setup = replace(self.setup, cells=msp.CellVoltages.decode(payload))
         self._done(self.setup)
 
 

@@ -40,19 +40,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     share_of,
 )
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import (
-    ANGLE_LIMIT_AT,
-    BETAFLIGHT,
-    RX_MSP,
-    USUAL_MAP,
-    FailsafeConfig,
-    Function,
-    ModeRange,
-    OnLoss,
-    RxConfig,
-    Sensor,
-    Status,
-)
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, USUAL_MAP, Function, ModeRange, OnLoss, RxConfig
 
 PORT: Final = 5761  #: TCP port of the first serial port in Betaflight's SITL
 CHANNELS: Final = 18
@@ -118,7 +106,7 @@ class BoardSettings:
     """The flight controller's settings, by default those described in ``docs/msp.md``."""
 
     ranges: tuple[ModeRange, ...] = (ModeRange(0, 0, 1700, 2100), ModeRange(1, 1, 900, 2100))
-    failsafe: FailsafeConfig = field(default_factory=lambda: FailsafeConfig(1.5, 60.0, 1000, 10.0, 1))
+    failsafe: msp.FailsafeConfig = field(default_factory=lambda: msp.FailsafeConfig(1.5, 60.0, 1000, 10.0, 1))
     on_loss: tuple[tuple[int, int], ...] = (
         ((OnLoss.AUTO, 1500),) * 3 + ((OnLoss.AUTO, 875),) + ((OnLoss.HOLD, 1500),) * (CHANNELS - 4)
     )
@@ -237,8 +225,8 @@ class Board:
             Function.FAILSAFE_CONFIG: settings.failsafe.encode,
             Function.RXFAIL_CONFIG: lambda: msp.pack_rx_fail(settings.on_loss),
             Function.RC_TUNING: lambda: pack_betaflight_rates(settings.rates),
-            Function.PID_ADVANCED: lambda: bytes(ANGLE_LIMIT_AT) + bytes((settings.angle_limit_deg,)) + bytes(43),
-            Function.FEATURE_CONFIG: lambda: (RX_MSP * settings.rx_msp).to_bytes(4, "little"),
+            Function.PID_ADVANCED: lambda: bytes(msp.ANGLE_LIMIT_AT) + bytes((settings.angle_limit_deg,)) + bytes(43),
+            Function.FEATURE_CONFIG: lambda: (msp.RX_MSP * settings.rx_msp).to_bytes(4, "little"),
             Function.BATTERY_CONFIG: lambda: bytes((33, 43)),
             Function.STATUS: lambda: self._status(now_ns).betaflight(),
             Function.STATUS_EX: lambda: self._status(now_ns).betaflight(),
@@ -259,11 +247,12 @@ class Board:
 
     # State ---------------------------------------------------------------------------------------------------------
 
-    def _status(self, now_ns: int) -> Status:
+    def _status(self, now_ns: int) -> msp.Status:
         settings = self.settings
-        sensors = 1 << Sensor.ACCELEROMETER | settings.barometer << Sensor.BAROMETER | settings.gps << Sensor.GPS
+        has = msp.Sensor
+        sensors = 1 << has.ACCELEROMETER | settings.barometer << has.BAROMETER | settings.gps << has.GPS
         modes = sum(1 << place for place, (number, _) in enumerate(BOXES) if number and self._is_on(number))
-        return Status(sensors, modes | self.armed, self._hindrances(now_ns), FLAGS, 125, 12)
+        return msp.Status(sensors, modes | self.armed, self._hindrances(now_ns), FLAGS, 125, 12)
 
     def _attitude(self) -> msp.Attitude:
         believed = self._seen.believed
