@@ -275,7 +275,7 @@ class ByteServer:
         self._on_bytes(data)
 
 
-# Firmware that is switched on and off ---------------------------------------------------------------------------------
+# Firmware that is switched on and off --------------------------------------------------------------------------------
 
 
 class Closable(Protocol):

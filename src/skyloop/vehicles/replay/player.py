@@ -173,7 +173,7 @@ class Playback:
             self._changed.set()
 
 
-# Publishing -----------------------------------------------------------------------------------------------------------
+# Publishing ----------------------------------------------------------------------------------------------------------
 
 #: Events from the vehicle itself. All others came from the recorded proxy or an application, and a client must not
 #: mistake them for events about its own authority or commands.

@@ -60,7 +60,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError
 
-# Constants and tables, for the emulator's encoder as well -----------------------------------------------------------
+# Constants and tables, for the emulator's encoder as well ------------------------------------------------------------
 
 START_CODE_BITS: Final = 22
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this plus k

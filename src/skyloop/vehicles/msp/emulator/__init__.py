@@ -42,6 +42,8 @@ from skyloop.vehicles.msp.wire.firmwares import (
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, USUAL_MAP, Function, ModeRange, OnLoss, RxConfig
 
+__all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]
+
 PORT: Final = 5761  #: TCP port of the first serial port in Betaflight's SITL
 CHANNELS: Final = 18
 HOVER_THROTTLE: Final = 0.32  #: hover throttle as a fraction of full throttle; an estimate
@@ -117,6 +119,9 @@ class BoardSettings:
     barometer: bool = True
     boot_s: float = 0.5  #: time until it can be armed [s]; 5 s with real ones
     flags: int = 0  #: additional flags that prevent arming, one bit each
+
+
+USUAL: Final = BoardSettings()
 
 
 def with_racers(options: SimOptions | None = None) -> SimOptions:
@@ -401,12 +406,7 @@ class Board:
         return math.copysign(self._tilt(min(1.0, abs(stick))), stick) if self._is_on(1) else 0.0
 
 
-# The firmware ---------------------------------------------------------------------------------------------------------
-
-__all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]
-
-
-USUAL: Final = BoardSettings()
+# The firmware --------------------------------------------------------------------------------------------------------
 
 
 class RunningFirmware(RunningEmulator):

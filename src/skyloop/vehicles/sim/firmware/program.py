@@ -227,7 +227,7 @@ def _last_words(folder: Path) -> str:
     return "; its output ends with:\n" + "\n".join(text.split("\n")[-_LAST_LINES:]) if text else ""
 
 
-# Coupled to a simulation ----------------------------------------------------------------------------------------------
+# Coupled to a simulation ---------------------------------------------------------------------------------------------
 
 WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out there is no more waiting until it replies
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers

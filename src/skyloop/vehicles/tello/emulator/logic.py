@@ -34,7 +34,7 @@ from skyloop.vehicles.tello.wire import (
     decoded,
 )
 
-# Commands that take time and are answered when they end; driven by reports ------------------------------------------
+# Commands that take time and are answered when they end; driven by reports -------------------------------------------
 
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
@@ -135,7 +135,7 @@ class Going:
 Job = Rising | Landing | Flipping | Turning | Going
 
 
-# The logic ------------------------------------------------------------------------------------------------------------
+# The logic -----------------------------------------------------------------------------------------------------------
 
 OUT_OF_RANGE: Final = "out of range"
 Range = tuple[int, int]
