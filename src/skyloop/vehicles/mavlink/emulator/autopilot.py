@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from enum import IntEnum
 from typing import ClassVar, Final
 
 from skyloop.messages import FlightState
@@ -21,11 +22,6 @@ from skyloop.vehicles.mavlink.wire.axes import Vector
 from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-ACCEPTED: Final = 0
-TEMPORARILY_REJECTED: Final = 1
-DENIED: Final = 2
-UNSUPPORTED: Final = 3
-FAILED: Final = 4
 FORCE: Final = 21196  #: parameter of the disarm command that means "even in flight"
 WARNING: Final = 4
 CRITICAL: Final = 2
@@ -44,6 +40,16 @@ _NOT_GIVEN: Final = 0x7FFFFFFF  #: value that means "no position" in COMMAND_INT
 Arguments = tuple[float, ...]
 Handler = Callable[[Arguments], int]
 PlaceHandler = Callable[[Arguments, int], int]
+
+
+class Result(IntEnum):
+    """Values of ``MAV_RESULT``."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
 
 
 class Autopilot(AutopilotState):
@@ -240,19 +246,19 @@ class Autopilot(AutopilotState):
             result = self._set_interval(port, whole(arguments[0]), arguments[1])
         elif number == m.MAV_CMD_GET_MESSAGE_INTERVAL:
             answer = self._interval(port, whole(arguments[0]))
-            result = ACCEPTED if answer is not None else FAILED
+            result = Result.ACCEPTED if answer is not None else Result.FAILED
         elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
             answer = self._requested(asked)
-            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
         elif number == m.MAV_CMD_GET_HOME_POSITION:
             answer = self._requested(m.MAVLINK_MSG_ID_HOME_POSITION)
-            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
         elif number in self._placed_commands:
-            result = UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
+            result = Result.UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
         else:
             handler = self._commands.get(number)
-            result = UNSUPPORTED if handler is None else handler(arguments)
+            result = Result.UNSUPPORTED if handler is None else handler(arguments)
         sender = message.get_srcSystem(), message.get_srcComponent()
         port.send(m.MAVLink_command_ack_message(number, result, 0, 0, *sender))
         if answer is not None:
@@ -275,23 +281,23 @@ class Autopilot(AutopilotState):
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
         if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # the comparison is also false for NaN
-            return FAILED
+            return Result.FAILED
         port.streams.set_interval(number, interval_us)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _arm_or_disarm(self, arguments: Arguments) -> int:
         forced = whole(arguments[1]) == FORCE
         if arguments[0] >= 0.5:
-            return ACCEPTED if self.armed else self._arm(forced)
+            return Result.ACCEPTED if self.armed else self._arm(forced)
         if not self.armed:
-            return ACCEPTED
+            return Result.ACCEPTED
         if self.flight.standing:
             self._disarm("")
-            return ACCEPTED
+            return Result.ACCEPTED
         if forced:
             self.flight.cut()
             self._disarm("")
-            return ACCEPTED
+            return Result.ACCEPTED
         return self._refuse_disarming()
 
     def _arm(self, forced: bool) -> int:
@@ -302,7 +308,7 @@ class Autopilot(AutopilotState):
         if not self._home_given:
             self.home = self.flight.place
         self.send_text(self.WORDS["armed"], INFO)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _disarm(self, text: str) -> None:
         self.armed = False

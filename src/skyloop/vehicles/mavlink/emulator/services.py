@@ -8,23 +8,16 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Iterable, Mapping
+from enum import IntEnum
 from typing import Final
 
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.wire.codec import REAL32, Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-MISSION_ACCEPTED: Final = 0
-MISSION_ERROR: Final = 1
-MISSION_UNSUPPORTED: Final = 3
-MISSION_NO_SPACE: Final = 4
-MISSION_INVALID_SEQUENCE: Final = 13
 MOST_ITEMS: Final = 500  #: maximum number of items in a mission
 _SCALE: Final = 1e7  #: scale of latitude and longitude in MISSION_ITEM_INT
 _HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
-MISSION_INVALID_X: Final = 10
-MISSION_INVALID_Y: Final = 11
-MISSION_INVALID_Z: Final = 12
 
 # The file protocol's requests and replies.
 _END_SESSION: Final = 1
@@ -45,6 +38,19 @@ _SIZE: Final = 4
 _ASKED: Final = 5
 _DATA: Final = 12
 _PAYLOAD: Final = 251
+
+
+class MissionResult(IntEnum):
+    """Values of ``MAV_MISSION_RESULT``."""
+
+    ACCEPTED = 0
+    ERROR = 1
+    UNSUPPORTED = 3
+    NO_SPACE = 4
+    INVALID_X = 10
+    INVALID_Y = 11
+    INVALID_Z = 12
+    INVALID_SEQUENCE = 13
 
 
 def mission_ack(message: Message, result: int) -> Message:
@@ -72,22 +78,22 @@ class Mission:
             return [m.MAVLink_mission_count_message(*sender, len(self._items) + 1, 0)]
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
             if not 0 <= message.seq <= len(self._items):
-                return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+                return [mission_ack(message, MissionResult.INVALID_SEQUENCE)]
             return [self._item(message.seq, sender, home, whole=kind == "MISSION_REQUEST_INT")]
         if kind == "MISSION_COUNT":
             self._coming, self._wanted = [], 0
             if message.count > MOST_ITEMS:
-                return [mission_ack(message, MISSION_NO_SPACE)]
+                return [mission_ack(message, MissionResult.NO_SPACE)]
             if not message.count:
                 self._items = []
-                return [mission_ack(message, MISSION_ACCEPTED)]
+                return [mission_ack(message, MissionResult.ACCEPTED)]
             self._wanted = message.count
             return [m.MAVLink_mission_request_message(*sender, 0, 0)]
         if kind in ("MISSION_ITEM", "MISSION_ITEM_INT") and self._wanted:
             return self._take(message, sender)
         if kind == "MISSION_CLEAR_ALL":
             self._items, self._wanted, self.current = [], 0, 0
-            return [mission_ack(message, MISSION_ACCEPTED)]
+            return [mission_ack(message, MissionResult.ACCEPTED)]
         if kind == "MISSION_SET_CURRENT":
             if not 0 <= message.seq <= len(self._items):
                 return []
@@ -97,12 +103,12 @@ class Mission:
 
     def _take(self, message: Message, sender: tuple[int, int]) -> list[Message]:
         if message.seq != len(self._coming):
-            return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+            return [mission_ack(message, MissionResult.INVALID_SEQUENCE)]
         self._coming.append(message)
         if len(self._coming) < self._wanted:
             return [m.MAVLink_mission_request_message(*sender, len(self._coming), 0)]
         self._items, self._coming, self._wanted, self.current = self._coming[1:], [], 0, 0
-        return [mission_ack(message, MISSION_ACCEPTED)]
+        return [mission_ack(message, MissionResult.ACCEPTED)]
 
     def _item(self, number: int, sender: tuple[int, int], home: tuple[int, int, int], *, whole: bool) -> Message:
         if number == 0:
@@ -127,11 +133,11 @@ def answers(message: Message) -> Iterable[Message]:
     if kind == "MISSION_REQUEST_LIST":
         yield m.MAVLink_mission_count_message(*sender, 0, message.mission_type)
     elif kind == "MISSION_COUNT":  # an upload; an empty one does not clear anything
-        yield mission_ack(message, MISSION_UNSUPPORTED if message.count else MISSION_ACCEPTED)
+        yield mission_ack(message, MissionResult.UNSUPPORTED if message.count else MissionResult.ACCEPTED)
     elif kind == "MISSION_CLEAR_ALL":
-        yield mission_ack(message, MISSION_ACCEPTED)
+        yield mission_ack(message, MissionResult.ACCEPTED)
     elif kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ITEM", "MISSION_ITEM_INT"):
-        yield mission_ack(message, MISSION_ERROR)  # an item that was not requested
+        yield mission_ack(message, MissionResult.ERROR)  # an item that was not requested
     elif kind == "LOG_REQUEST_LIST":
         yield m.MAVLink_log_entry_message(0, 0, 0, 0, 0)
     elif kind == "FILE_TRANSFER_PROTOCOL":
