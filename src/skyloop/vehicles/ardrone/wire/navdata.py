@@ -88,7 +88,7 @@ class ControlState(IntEnum):
 
 Floats: TypeAlias = tuple[float, ...]
 Ints: TypeAlias = tuple[int, ...]
-Option: TypeAlias = tuple[Any, ...]  #: a named tuple, one of those below
+Option: TypeAlias = Any  #: a named tuple, one of those below
 
 
 class Layout:
@@ -350,7 +350,7 @@ class Navdata:
 
     def get(self, kind: type[_Option]) -> _Option | None:
         """Return the option of this type; None if the datagram has none."""
-        return cast("_Option | None", cast("dict[Any, Any]", self.options).get(kind))
+        return cast("_Option | None", self.options.get(kind))
 
 
 def decode(datagram: bytes | memoryview) -> Navdata:
