@@ -26,7 +26,7 @@ from skyloop.vehicles.ardrone.emulator.video import H264_360P
 from skyloop.vehicles.ardrone.emulator.video import encode as encode_uvlc
 from skyloop.vehicles.ardrone.video import PaveVideo
 from skyloop.vehicles.ardrone.wire import navdata
-from skyloop.vehicles.ardrone.wire.options import LAYOUTS
+from skyloop.vehicles.ardrone.wire.navdata import LAYOUTS
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 from skyloop.vehicles.emulation.video import GROUP, Encoder

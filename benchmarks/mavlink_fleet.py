@@ -31,7 +31,7 @@ from skyloop.host.vehicle import SharedVehicle
 from skyloop.messages import Feedback, LinkState, Position
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.emulation.datagrams import Loop
+from skyloop.vehicles.emulation.emulator import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
 RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands

@@ -28,7 +28,7 @@ from skyloop.bench import Machine
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Applied, Velocity
 from skyloop.vehicles.ardrone.wire import navdata
-from skyloop.vehicles.ardrone.wire.options import LAYOUTS
+from skyloop.vehicles.ardrone.wire.navdata import LAYOUTS
 
 SIZES = ["320×240", "1920×1080"]
 #: Median delays of the made-up results [µs], times 10 with the large frames.

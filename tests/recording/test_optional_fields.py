@@ -40,8 +40,7 @@ from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import export_csv, export_npz, export_parquet, read
 from skyloop.recording.translation import Message, Picture, Translator
 from skyloop.recording.writer import RecordingFile
-from skyloop.vehicles.replay.playback import Playback
-from skyloop.vehicles.replay.player import StepPlayer
+from skyloop.vehicles.replay.player import Playback, StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource
 from tests.support.recorded_flights import BEGIN_NS, CAPABILITIES, UNIX_NS, Plan, feedback_at, picture_at
 from tests.support.samples import SAMPLES, TILT

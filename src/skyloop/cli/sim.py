@@ -302,8 +302,7 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 
 def _racers(options: SimOptions, drones: int, serving: Serving) -> list[BetaflightFirmware]:
     from skyloop.sim.host import SimHost
-    from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
-    from skyloop.vehicles.msp.emulator.board import PORT
+    from skyloop.vehicles.msp.emulator import PORT, BetaflightFirmware, with_racers
 
     if serving.faults.drop or serving.delay_s:
         raise UsageError(

@@ -12,8 +12,7 @@ from skyloop.vehicles.ardrone.options import ArdroneOptions
 from skyloop.vehicles.ardrone.protocol import ArdroneSession
 from skyloop.vehicles.ardrone.wire.at import AtCommand, Ctrl, Ref, parse_commands
 from skyloop.vehicles.ardrone.wire.configuration import DEFAULT_ID, Value, format_dump, keys_of, parse_value
-from skyloop.vehicles.ardrone.wire.navdata import ControlState, State, encode
-from skyloop.vehicles.ardrone.wire.options import Demo, Option
+from skyloop.vehicles.ardrone.wire.navdata import ControlState, Demo, Option, State, encode
 
 STEP_S: Final = 0.01
 NAVDATA_STEPS: Final = 2

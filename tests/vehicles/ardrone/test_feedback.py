@@ -26,8 +26,20 @@ from skyloop.vehicles.ardrone.telemetry import (
     flight_state,
     native_of,
 )
-from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode, encode
-from skyloop.vehicles.ardrone.wire.options import Demo, Gps, PhysMeasures, RawMeasures, Time, VisionDetect, Wifi
+from skyloop.vehicles.ardrone.wire.navdata import (
+    ControlState,
+    Demo,
+    Gps,
+    Navdata,
+    PhysMeasures,
+    RawMeasures,
+    State,
+    Time,
+    VisionDetect,
+    Wifi,
+    decode,
+    encode,
+)
 from tests.support.recordings import recorded
 from tests.vehicles.ardrone.scripted import ns
 

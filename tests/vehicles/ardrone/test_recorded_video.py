@@ -17,8 +17,7 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.messages import LinkState
 from skyloop.vehicles.ardrone.driver import ArdroneDriver
-from skyloop.vehicles.ardrone.wire.navdata import Navdata, decode
-from skyloop.vehicles.ardrone.wire.options import Demo, Time
+from skyloop.vehicles.ardrone.wire.navdata import Demo, Navdata, Time, decode
 from tests.support.recordings import recorded
 from tests.vehicles.ardrone.scripted import ScriptedDrone
 from tests.vehicles.ardrone.video_ports import HOST, LONG, SHORT, TcpPort, digest, frames, pieces, true_pictures

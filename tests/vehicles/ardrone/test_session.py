@@ -23,8 +23,7 @@ from skyloop.messages import (
 from skyloop.vehicles.ardrone.configuration import Exchange, Read, Write
 from skyloop.vehicles.ardrone.options import ArdroneOptions
 from skyloop.vehicles.ardrone.wire.at import Ref
-from skyloop.vehicles.ardrone.wire.navdata import State, encode
-from skyloop.vehicles.ardrone.wire.options import Demo, Time
+from skyloop.vehicles.ardrone.wire.navdata import Demo, State, Time, encode
 from tests.support.recordings import content, needs_recordings
 from tests.vehicles.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
 

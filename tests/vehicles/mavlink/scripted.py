@@ -10,9 +10,8 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
 from skyloop.vehicles.mavlink.options import MavlinkOptions, Peer, options_of
 from skyloop.vehicles.mavlink.protocol import TICK_NS, MavlinkSession
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, Codec, Landed, Message, px4_custom
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, Landed, px4_custom
 
 PEER: Peer = ("127.0.0.1", 14580)
 PX4 = 12

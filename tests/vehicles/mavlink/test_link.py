@@ -32,9 +32,8 @@ from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.link import MavlinkLink, TcpClient
 from skyloop.vehicles.mavlink.protocol import MavlinkSession
-from skyloop.vehicles.mavlink.wire.codec import Codec
+from skyloop.vehicles.mavlink.wire.codec import Codec, Landed
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 from tests.vehicles.mavlink.scripted import ARDUPILOT, Vehicle, options
 
 PATIENCE_S = 15.0

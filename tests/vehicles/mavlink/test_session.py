@@ -32,9 +32,8 @@ from skyloop.vehicles.mavlink.options import PoseMessage
 from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.vehicles.mavlink.setpoints import STEP_NS, Goal
 from skyloop.vehicles.mavlink.telemetry import VehicleState
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message, chunks_of
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, Codec, Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS
 from tests.support.recordings import recorded
 from tests.vehicles.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
 

@@ -23,8 +23,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.mavlink.wire.axes import angles_of, from_wire
-from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
-from skyloop.vehicles.mavlink.wire.modes import Landed
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message, chunks_of
 from tests.vehicles.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
 
 ARM, MODE, TAKEOFF = 400, 176, 22

@@ -18,7 +18,7 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.msp.emulator.board import RACER, Board, BoardSettings
+from skyloop.vehicles.msp.emulator import RACER, Board, BoardSettings
 from skyloop.vehicles.msp.parameters import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode

@@ -17,8 +17,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, FlightState, LinkState, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
-from skyloop.vehicles.msp.emulator import BetaflightFirmware
-from skyloop.vehicles.msp.emulator.board import bit
+from skyloop.vehicles.msp.emulator import BetaflightFirmware, bit
 from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels

@@ -13,7 +13,7 @@ from skyloop.clock import NS_PER_S
 from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
-from skyloop.vehicles.msp.emulator.board import EMPTY_WRITES, BoardSettings, bit
+from skyloop.vehicles.msp.emulator import EMPTY_WRITES, BoardSettings, bit
 from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import Motion

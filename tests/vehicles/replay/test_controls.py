@@ -26,8 +26,7 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.recording.reader import Entry, Recording
 from skyloop.recording.scan import Piece
 from skyloop.transport.memory import MemoryServer
-from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback
-from skyloop.vehicles.replay.player import IDLE_S, Player
+from skyloop.vehicles.replay.player import IDLE_S, PAUSED, POSITION, SPEED, Playback, Player
 from skyloop.vehicles.replay.source import ReplaySource, Timeline
 from tests.support.recorded_flights import BEGIN_NS, MS, WIDTH, Plan, feedback_at, write_flight
 

@@ -87,11 +87,9 @@ class Configurator:
 
     @property
     def busy(self) -> bool:
-        """Whether an exchange is running or waiting."""
         return self._exchange is not None or bool(self._queue)
 
     def submit(self, exchange: Exchange) -> None:
-        """Queue an exchange."""
         self._queue.append(exchange)
         if self._exchange is None:
             self._next_exchange()
@@ -264,17 +262,10 @@ def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
 
 
 class Setup:
-    """The steps that set up one drone.
+    """The steps that set up one drone, with our own ids and the keys ``remembered`` from before a link loss.
 
     Once the steps are done, ``version`` is known, unless the drone does not report it, and ``refused_ids`` is True if
-    the drone did not accept our own settings.
-
-    Args:
-        options: Options of the vehicle's address.
-        configurator: Runs the steps.
-        ids: Our own ids.
-        remembered: Keys that an application wrote before the link was lost; those that the drone has since forgotten
-            are written again.
+    the drone did not accept our own settings. Remembered keys that the drone has since forgotten are written again.
     """
 
     def __init__(

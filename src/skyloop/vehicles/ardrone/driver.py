@@ -12,16 +12,7 @@ from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError, SkyloopError
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    EventKind,
-    Intrinsics,
-    Parameter,
-    Refusal,
-    Severity,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, EventKind, Intrinsics, Parameter, Refusal, Severity, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
 from skyloop.vehicles.ardrone.link import ArdroneLink
@@ -59,8 +50,6 @@ class ArdroneDriver(Driver):
             description=f"a Parrot AR.Drone{f' {version}' if version else ''} at {self.options.host}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         if self.options.video:
             make_decoder(self.options.version or 2)  # raises an error now if the decoder's library is not installed
@@ -87,8 +76,6 @@ class ArdroneDriver(Driver):
             if self._video is None and self.options.video and session.version is not None:
                 self._start_video(sink, session.version)
 
-    # Flying ----------------------------------------------------------------------------------------------------
-
     def _apply(self, action: AnyAction) -> AnyAction:
         if action.name not in ACTIONS:
             return super()._apply(action)
@@ -104,8 +91,6 @@ class ArdroneDriver(Driver):
         with link.lock:
             state, values = link.session.state, dict(link.session.configurator.values)
         return diagnose(state, values)
-
-    # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
         """Return the commands that are not actions, and the drone's configuration once it has been read."""
@@ -152,8 +137,6 @@ class ArdroneDriver(Driver):
         with link.lock:
             values, version = dict(link.session.configurator.values), link.session.version
         return entries_of(values, version)
-
-    # Video -----------------------------------------------------------------------------------------------------
 
     def _start_video(self, sink: Sink, version: int) -> None:
         options = self.options

@@ -118,7 +118,6 @@ class DumpClient:
     """Fetches the dump that the configurator requests, over a separate connection to the control port."""
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
-        """Store the arguments. No I/O."""
         self.address = ""  #: the drone's address; empty until known
         self._port = port
         self._selector = selector

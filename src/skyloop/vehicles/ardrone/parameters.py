@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -79,10 +79,7 @@ _COMMON: Final = (
     _Common("camera.fps", "video:codec_fps", "1/s", 1, "pictures a second of the video"),
 )
 CHANNEL_KEY: Final = "video:video_channel"
-_CHANNELS: Final = {
-    1: ("front", "bottom", "front_with_bottom", "bottom_with_front"),
-    2: ("front", "bottom"),
-}
+_CHANNELS: Final = {1: ("front", "bottom", "front_with_bottom", "bottom_with_front"), 2: ("front", "bottom")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +93,7 @@ class Entry:
     names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if it has no named values
 
     def to_text(self, value: Value) -> str:
-        """Convert a value to the drone's notation.
-
-        Raises:
-            ParameterError: The value has the wrong type, is not finite, or is not one of the names.
-        """
+        """Convert a value to the drone's notation; raise :class:`ParameterError` if its type or name does not fit."""
         if self.names:
             if value not in self.names:
                 raise _wrong(self.parameter, f"is one of {', '.join(self.names)}")
@@ -115,11 +108,7 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """Convert the drone's text to a value.
-
-        Raises:
-            DecodeError: The text does not fit the key's type.
-        """
+        """Convert the drone's text to a value; raise :class:`DecodeError` if it does not fit the key's type."""
         value = parse_value(text, self.like)
         if self.names:
             number = int(str(value))
@@ -277,9 +266,7 @@ def _widened(parameter: Parameter) -> Parameter:
         return parameter
     low, high = parameter.minimum, parameter.maximum
     return msgspec.structs.replace(
-        parameter,
-        minimum=low if low is None else min(low, value),
-        maximum=high if high is None else max(high, value),
+        parameter, minimum=low if low is None else min(low, value), maximum=high if high is None else max(high, value)
     )
 
 
@@ -293,42 +280,37 @@ _MAGNETOMETER: Final = 0  #: device number for ``CALIB``
 _HALF_TURN: Final = 3.1416  #: π rounded up [rad], so that π itself is within the range
 
 
-def _switch(name: str, description: str) -> Parameter:
-    return Parameter(name, ParameterType.BOOL, False, default=False, description=description)
+def _switch(name: str, description: str, *, momentary: bool) -> Parameter:
+    """Return a switch, which triggers an action each time it is written if it is ``momentary``."""
+    return Parameter(name, ParameterType.BOOL, False, default=False, description=description, momentary=momentary)
 
 
-def _once(parameter: Parameter) -> Parameter:
-    """Mark a parameter that triggers an action each time it is written."""
-    return msgspec.structs.replace(parameter, momentary=True)
-
-
-def _choice(name: str, names: tuple[str, ...], description: str) -> Parameter:
-    choices = (NO_ANIMATION, *names)
-    return Parameter(
-        name, ParameterType.TEXT, NO_ANIMATION, default=NO_ANIMATION, choices=choices, description=description
-    )
+def _animation(name: str, names: Iterable[str], description: str) -> Parameter:
+    none, kind = NO_ANIMATION, ParameterType.TEXT
+    return Parameter(name, kind, none, default=none, choices=(none, *names), description=description, momentary=True)
 
 
 def _number(name: str, value: float, unit: str, low: float, high: float, description: str) -> Parameter:
     return Parameter(name, ParameterType.FLOAT, value, unit, low, high, value, description=description)
 
 
-_LEDS: Final = _once(
-    _choice("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
-)
+_LEDS: Final = _animation("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
 _LEDS_FREQUENCY: Final = _number("leds.frequency", 2.0, "1/s", 0.1, 50.0, "of the next animation of the lights")
 _LEDS_DURATION: Final = _number(
     "leds.duration", 3.0, "s", 0.0, 3600.0, "of the next one, in whole seconds; 0: for ever"
 )
-_TRIM: Final = _once(
-    _switch("ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only")
+_TRIM: Final = _switch(
+    "ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only", momentary=True
 )
-_CALIBRATE: Final = _once(
-    _switch("ardrone.calibrate_magnetometer", "true: the drone turns about itself to calibrate (CALIB); in flight only")
+_CALIBRATE: Final = _switch(
+    "ardrone.calibrate_magnetometer",
+    "true: the drone turns about itself to calibrate (CALIB); in flight only",
+    momentary=True,
 )
 _ABSOLUTE: Final = _switch(
     "ardrone.absolute_control",
     "roll and pitch are along ardrone.absolute_heading and not along the drone's nose (PCMD_MAG)",
+    momentary=False,
 )
 _HEADING: Final = _number(
     "ardrone.absolute_heading",
@@ -342,8 +324,8 @@ _HEADING: Final = _number(
 
 def _flight_animations(version: int | None) -> Parameter:
     known = FLIGHT_ANIMATIONS[:FIRST_FLIP] if version == 1 else FLIGHT_ANIMATIONS
-    names = tuple(name for name, _ in known)
-    return _once(_choice("ardrone.flight_animation", names, "flies this animation (ANIM, sent once); in flight only"))
+    text = "flies this animation (ANIM, sent once); in flight only"
+    return _animation("ardrone.flight_animation", (name for name, _ in known), text)
 
 
 class Commands:
@@ -364,9 +346,8 @@ class Commands:
     def write(self, parameter: Parameter, value: Value) -> Value:
         """Send a command and return the parameter's new value.
 
-        Raises:
-            ParameterError: The value is invalid, or the command requires the drone to be on the ground (or in the air)
-                and it is not.
+        Raises :class:`ParameterError` for an invalid value, or if the drone must be on the ground (or in the air) and
+        is not.
         """
         value = checked_value(parameter, value)
         name = parameter.name

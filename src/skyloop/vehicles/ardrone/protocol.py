@@ -23,8 +23,7 @@ from skyloop.vehicles.ardrone.telemetry import (
     native_of,
 )
 from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
-from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
-from skyloop.vehicles.ardrone.wire.options import Demo
+from skyloop.vehicles.ardrone.wire.navdata import Demo, Navdata, State
 
 #: Number of datagrams that begin at sequence 1 after a restart; one may be lost, and only a 1 resets the drone's count.
 FRESH_DATAGRAMS: Final = 3
@@ -77,12 +76,7 @@ class ArdroneSession(VehicleSession):
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
     def __init__(
-        self,
-        options: ArdroneOptions,
-        ids: Ids,
-        now_ns: int,
-        *,
-        extra: Callable[[], Mapping[str, Value]] = dict,
+        self, options: ArdroneOptions, ids: Ids, now_ns: int, *, extra: Callable[[], Mapping[str, Value]] = dict
     ) -> None:
         super().__init__(now_ns)
         self.options = options

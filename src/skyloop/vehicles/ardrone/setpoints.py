@@ -17,13 +17,12 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,
     Attitude,
     EmergencyStop,
-    EventKind,
     Hover,
     Idle,
     Land,
@@ -191,19 +190,11 @@ class SetpointController:
     # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
+        """Accept one of the driver's ``ACTIONS``.
 
-        Args:
-            action: One of the driver's ``ACTIONS``.
-            now_ns: The present time.
-
-        Returns:
-            The applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
-            emergency stop is in force.
-
-        Raises:
-            DriverError: A take-off while the drone is silent or in an emergency, a reset while it is silent, or an
-                action that the drone does not support.
+        Returns the applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
+        emergency stop is in force. Raises :class:`DriverError` for a take-off while the drone is silent or in an
+        emergency, and for a reset while it is silent.
         """
         if isinstance(action, Idle):
             return action
@@ -268,9 +259,7 @@ class SetpointController:
             if not self._warned_blind:
                 self._warned_blind = True
                 text = "the drone's limits are not known yet: it hovers instead of following set-points"
-                self._events.append(
-                    VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "limits_unknown"})
-                )
+                self._events.append(message(text, "limits_unknown", Severity.WARNING))
             return Hover()
         stick, applied = stick_of(action, self.limits)
         self._remain(stick)
@@ -288,11 +277,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        Args:
-            condition: The navdata's content.
-            now_ns: The present time.
-            passed_ns: The drone's own time since the previous navdata; None if it is the same as here. It distinguishes
-                delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. It
+        distinguishes delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
@@ -335,7 +321,6 @@ class SetpointController:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -386,9 +371,7 @@ class SetpointController:
                 return Ref.TAKEOFF
             self._decision = Decision.STAY
             text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"
-            self._events.append(
-                VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "no_takeoff"})
-            )
+            self._events.append(message(text, "no_takeoff", Severity.WARNING))
         if self._decision is Decision.LAND:
             return Ref(0)
         if self.condition is None:

@@ -14,14 +14,24 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from skyloop.clock import LiveClock, nanoseconds, seconds
-from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
+from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent, message
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.wire.configuration import NO_CEILING_MM
-from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode
-from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, PhysMeasures, RawMeasures, Time, VisionDetect
+from skyloop.vehicles.ardrone.wire.navdata import (
+    LAYOUTS,
+    ControlState,
+    Demo,
+    Navdata,
+    PhysMeasures,
+    RawMeasures,
+    State,
+    Time,
+    VisionDetect,
+    decode,
+)
 
 # Reception -----------------------------------------------------------------------------------------------------------
 
@@ -295,19 +305,16 @@ class Health:
         for bit, name, text, severity in _CONDITIONS:
             if not changed & bit:
                 continue
-            data: dict[str, Value] = {"reason": name, "active": bool(state & bit)}
             if state & bit:
-                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, data))
+                found.append(message(text, name, severity, active=True))
             else:
-                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, f"no longer: {text}", Severity.INFO, data))
+                found.append(message(f"no longer: {text}", name, active=False))
         return found
 
 
 def _emergency(state: State) -> VehicleEvent:
     if not state & State.EMERGENCY:
-        return VehicleEvent(
-            EventKind.VEHICLE_MESSAGE, "the drone left the emergency", Severity.INFO, {"reason": "reset"}
-        )
+        return message("the drone left the emergency", "reset")
     reason = emergency_reason(state)
     text = f"the drone cut its motors ({reason}); reset the emergency when it lies safely"
     return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})

@@ -147,25 +147,15 @@ WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1; any small datagr
 _CHUNK: Final = 1 << 16
 
 
-class PaveStream:
+class PaveStream(PaveAssembly):
     """A connection to an AR.Drone 2: PaVE over TCP."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
+        super().__init__(connection)
         self._clock = clock
-        self._assembly = PaveAssembly(connection)
         self._received_ns = clock()
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.settimeout(POLL_S)
-
-    @property
-    def broken(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
-        return self._assembly.broken
-
-    @property
-    def lost_bytes(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
-        return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
         """Return the frames that arrive within :data:`POLL_S`."""
@@ -175,15 +165,14 @@ class PaveStream:
             frames = []
         else:
             if not data:
-                self._assembly.end()
+                self.end()
                 raise ConnectionError("the drone ended the stream")
-            frames = self._assembly.feed(data, self._clock())
+            frames = self.feed(data, self._clock())
         self._received_ns = self._clock() if frames else self._received_ns
         _give_up_if_silent(self._clock() - self._received_ns)
         return frames
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()
 
 
@@ -226,7 +215,6 @@ class DatagramStream:
         return []
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
@@ -259,16 +247,13 @@ class PaveVideo:
 
     @property
     def waited(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         return self._decoder.waited
 
     @property
     def damaged(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         return self._decoder.damaged
 
     def restart(self) -> None:
-        """Wait for the next key frame."""
         self._decoder.restart()
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
@@ -352,7 +337,6 @@ class EncodedStream:
     def __init__(
         self, sink: Sink, camera: Callable[[], str], intrinsics: Callable[[int, int], Intrinsics | None]
     ) -> None:
-        """Store the arguments."""
         self._camera = camera
         self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
@@ -390,7 +374,6 @@ class VideoReceiver(LiveVideo):
         came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store the arguments. No I/O."""
         if version not in (1, 2):
             raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
 

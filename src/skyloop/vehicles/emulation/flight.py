@@ -43,20 +43,16 @@ class SimulatedVehicle:
 
     @property
     def state(self) -> FlightState:
-        """True flight state."""
         return self._simulation.state(self._drone)
 
     @property
     def ceiling_m(self) -> float:
-        """Height of its world [m]."""
         return self._simulation.world.room.size_m[2]
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the body, and return the applied action."""
         return self._simulation.command(self._drone, action)
 
     def set_limits(self, limits: Limits) -> None:
-        """Set the limits for set-points."""
         self._simulation.set_limits(self._drone, limits)
 
 
@@ -105,7 +101,6 @@ class FlightControl:
         vehicle.set_limits(LIMITS)
 
     def update(self, report: Report) -> None:
-        """Handle the vehicle's newest estimate."""
         believed, (east, north, _) = report.believed, report.truth.position_m
         if self._home is None:
             self._home = east, north
@@ -127,7 +122,6 @@ class FlightControl:
 
     @property
     def state(self) -> FlightState:
-        """The vehicle's flight state."""
         return self.vehicle.state
 
     @property
@@ -148,11 +142,9 @@ class FlightControl:
             self.vehicle.command(Takeoff())
 
     def hold(self) -> None:
-        """Hold the position."""
         self._fly(Hover())
 
     def land(self) -> None:
-        """Land."""
         if self.vehicle.state not in (FlightState.LANDING, FlightState.LANDED):
             self.vehicle.command(Land())
 

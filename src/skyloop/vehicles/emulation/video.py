@@ -47,7 +47,6 @@ class OneCamera:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """See :class:`VideoSettings`."""
         return (self.camera,)
 
     @property
@@ -89,10 +88,7 @@ class Packer(Protocol[S_contra]):
 class VideoEncoding(Generic[S]):
     """Encodes on a separate thread. Of the images that arrive during encoding, only the newest is kept.
 
-    Args:
-        packer: The encoder; used only on that thread.
-        settings: Returns the cameras to send. Called on any thread.
-        send: Called on that thread with each encoded image.
+    ``packer`` is used and ``send`` called, with each encoded image, only on that thread; ``settings`` on any.
     """
 
     def __init__(self, packer: Packer[S], settings: Callable[[], S], send: Callable[[Piece], None]) -> None:
@@ -108,11 +104,9 @@ class VideoEncoding(Generic[S]):
         self.status = NOTHING_SENT
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread and wait for it."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -204,18 +198,10 @@ class Encoded:
 
 
 class Encoder:
-    """Encodes one stream.
+    """Encodes one stream with a key frame every ``group`` images.
 
-    Args:
-        form: Codec and size.
-        fps: Images per second.
-        bitrate_kbps: Average bitrate.
-        group: Number of images from one key frame to the next.
-        profile: H.264 profile.
-        buffer_s: Size of the rate control's buffer, in seconds of the bitrate; None to let images have any size.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
+    ``buffer_s`` is the size of the rate control's buffer, in seconds of the bitrate; None to let images have any size.
+    Raises :class:`MissingExtraError` if PyAV is not installed.
     """
 
     def __init__(

@@ -9,13 +9,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.microservices import VehicleCommand
 from skyloop.vehicles.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error
@@ -25,48 +25,27 @@ LEAST_THRUST: Final = 0.1  #: lower limit of the thrust field
 MOST_THRUST: Final = 0.9  #: upper limit of the thrust field
 
 
-class ThrustModel(Protocol):
-    """Computes the thrust field of ``SET_ATTITUDE_TARGET`` from a climb rate, for one flight by attitude.
-
-    ArduCopter interprets the field as a climb rate: 0.5 holds the altitude. PX4 interprets it as collective thrust, so
-    we hold the altitude with a proportional-integral loop on the climb rate, whose integral is an altitude error.
-    """
-
-    def limit_climb(self, climb_m_s: float) -> float:
-        """Return the climb rate limited to what the autopilot accepts, positive up [m/s]."""
-
-    def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
-        """Return the thrust field, 0 to 1.
-
-        Args:
-            climb_m_s: Requested climb rate, positive up.
-            climbing_m_s: Measured climb rate, if known.
-            tilt_rad: Requested tilt.
-            step_s: Time since the last call.
-        """
-
-
 class ClimbRateThrust:
-    """Thrust field for ArduCopter: a fraction of its maximum climb or descent rate."""
+    """Thrust field of ``SET_ATTITUDE_TARGET`` for ArduCopter: a fraction of its maximum climb or descent rate."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s
 
     def limit_climb(self, climb_m_s: float) -> float:
-        """See :meth:`ThrustModel.limit_climb`."""
+        """Return the climb rate limited to what the autopilot accepts, positive up [m/s]."""
         return max(-self._down, min(self._up, climb_m_s))
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:  # noqa: ARG002
-        """See :meth:`ThrustModel.thrust`."""
+        """Return the thrust field, 0 to 1, for a requested climb rate, positive up; 0.5 holds the altitude."""
         climb = self.limit_climb(climb_m_s)
         return 0.5 + 0.5 * climb / (self._up if climb > 0 else self._down)
 
 
 class CollectiveThrust:
-    """Thrust field for PX4: collective thrust, computed by a loop that holds the climb rate.
+    """The same field for PX4: collective thrust.
 
-    Args:
-        hover: The hover thrust (``MPC_THR_HOVER``); an implausible value is replaced by 0.5.
+    A proportional-integral loop, whose integral is an altitude error, holds the climb rate during one flight by
+    attitude. An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -74,11 +53,11 @@ class CollectiveThrust:
         self._error_m = 0.0
 
     def limit_climb(self, climb_m_s: float) -> float:
-        """See :meth:`ThrustModel.limit_climb`."""
+        """Return the climb rate, which PX4 does not limit."""
         return climb_m_s
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
-        """See :meth:`ThrustModel.thrust`."""
+        """Return the thrust field, 0 to 1, for a requested climb rate, positive up, the measured one, and a tilt."""
         error = climb_m_s - climbing_m_s if climbing_m_s is not None else 0.0
         self._error_m += error * step_s
         self._error_m = max(-MOST_ALTITUDE_ERROR_M, min(MOST_ALTITUDE_ERROR_M, self._error_m))
@@ -87,6 +66,7 @@ class CollectiveThrust:
         return max(LEAST_THRUST, min(MOST_THRUST, thrust))
 
 
+ThrustModel = ClimbRateThrust | CollectiveThrust
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 REACHED_M: Final = 0.2  #: a take-off counts as complete this far below its target altitude
 EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position
@@ -158,13 +138,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether a take-off is complete.
-
-        Args:
-            vehicle: The vehicle's state.
-            height_m: The take-off height.
-            rose: Whether the vehicle has been in the air since the take-off was accepted.
-        """
+        """Return whether a take-off is complete; ``rose``: it has been in the air since the take-off was accepted."""
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
@@ -203,26 +177,16 @@ class ArduCopterProfile(AutopilotProfile):
     BYTEWISE = False
     SAFETY_NETS = (
         _SafetyNet("FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until the battery is empty", 7),
-        _SafetyNet(
-            "FS_GCS_TIMEOUT",
-            "time until its loss counts",
-            lambda s: s <= 5,
-            "it takes over 5 s",
-            5,
-            "s",
-        ),
+        _SafetyNet("FS_GCS_TIMEOUT", "time until its loss counts", lambda s: s <= 5, "it takes over 5 s", 5, "s"),
         _SafetyNet("GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it keeps flying for too long", 1, "s"),
         _SafetyNet("FS_EKF_ACTION", "loss of position", _on, "it does nothing", 1),
         _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing", 1),
         _SafetyNet("FENCE_ENABLE", "fence", _on, "it has none of its own", 1),
     )
 
-    def mode_of(self, custom_mode: int) -> str:
-        """Return the mode's name."""
-        return copter_mode(custom_mode)
+    mode_of = staticmethod(copter_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
-        """Return the command that changes the mode."""
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(COPTER_NUMBERS[mode])))
 
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:  # noqa: ARG002
@@ -290,14 +254,7 @@ class Px4Profile(AutopilotProfile):
     BYTEWISE = True
     SAFETY_NETS = (
         _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "it only drops the last set-point", 1),
-        _SafetyNet(
-            "COM_DL_LOSS_T",
-            "time until its loss counts",
-            lambda s: s <= 10,
-            "it takes over 10 s",
-            5,
-            "s",
-        ),
+        _SafetyNet("COM_DL_LOSS_T", "time until its loss counts", lambda s: s <= 10, "it takes over 10 s", 5, "s"),
         _SafetyNet(
             "COM_OF_LOSS_T",
             "time until set-points are missed",
@@ -314,22 +271,12 @@ class Px4Profile(AutopilotProfile):
             5,
         ),
         _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "it only warns", 2),
-        _SafetyNet(
-            "GF_MAX_VER_DIST",
-            "ceiling",
-            lambda height: height > 0,
-            "it has none of its own",
-            30,
-            "m",
-        ),
+        _SafetyNet("GF_MAX_VER_DIST", "ceiling", lambda height: height > 0, "it has none of its own", 30, "m"),
     )
 
-    def mode_of(self, custom_mode: int) -> str:
-        """Return the mode's name."""
-        return px4_mode(custom_mode)
+    mode_of = staticmethod(px4_mode)
 
     def mode_command(self, mode: str) -> VehicleCommand:
-        """Return the command that changes the mode."""
         main, sub = PX4_NUMBERS[mode]
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(main), float(sub)))
 

@@ -11,15 +11,7 @@ from skyloop.drivers.live_camera import LiveCamera
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import deliver
 from skyloop.errors import DriverError, ParameterError
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    Hover,
-    Land,
-    Parameter,
-    Refusal,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, Hover, Land, Parameter, Refusal, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.link import MavlinkLink
 from skyloop.vehicles.mavlink.microservices import pose_message
@@ -62,8 +54,6 @@ class MavlinkDriver(Driver):
             description=f"a MAVLink vehicle on {self.options.address}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         if self.options.camera is not None:
             self._camera = camera_receiver(self.uri, self.options.camera, sink)
@@ -82,8 +72,6 @@ class MavlinkDriver(Driver):
 
     def _camera_telemetry(self) -> dict[str, Value]:
         return {} if self._camera is None else self._camera.telemetry()
-
-    # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
         return self._opened().command(action)
@@ -133,8 +121,6 @@ class MavlinkDriver(Driver):
             raise DriverError(f"{self.uri} is not open")
         return self._link
 
-    # Parameters ------------------------------------------------------------------------------------------------
-
     def parameters(self) -> list[Parameter]:
         """Return the driver's own limits, plus the autopilot's parameters once they have been read."""
         return [*limit_parameters(self._limits), *(each.parameter for each in self._vehicle_parameters().values())]
@@ -177,9 +163,5 @@ class MavlinkDriver(Driver):
         return vehicle_parameters(reported)
 
 
-_ARMING: Final = {
-    True: "it reports that it can be armed",
-    False: "it can't be armed and refuses to take off",
-    None: "",
-}
+_ARMING: Final = {True: "it reports that it can be armed", False: "it can't be armed and refuses to take off", None: ""}
 _PREARM: Final = "see its messages (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"

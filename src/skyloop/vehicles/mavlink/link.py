@@ -6,7 +6,7 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import ServedLink
@@ -22,35 +22,10 @@ MAX_DATAGRAM: Final = 65_536  #: bytes
 BURST: Final = 64  #: maximum number of datagrams per read, so that other links get their turn
 
 
-class MavlinkConnection(Protocol):
-    """An open socket or port."""
-
-    whole: bool  #: whether each received piece is a whole datagram
-    dropped: int  #: number of packets dropped instead of sent
-
-    def fileno(self) -> int: ...
-
-    def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return the received bytes, each piece with its sender.
-
-        Raises:
-            OSError: The connection has ended.
-        """
-
-    def send(self, packet: Packet) -> None:
-        """Send a packet, or drop it if the buffer is full.
-
-        Raises:
-            OSError: The connection can't send.
-        """
-
-    def close(self) -> None: ...
-
-
 class UdpListener:
     """A UDP port that replies to the sender of the newest datagram."""
 
-    whole = True
+    whole = True  #: whether each received piece is a whole datagram
 
     def __init__(self, address: Address) -> None:
         self.dropped = 0
@@ -66,7 +41,6 @@ class UdpListener:
             raise
 
     def fileno(self) -> int:
-        """Return the file descriptor."""
         return self._socket.fileno()
 
     def receive(self) -> list[tuple[bytes, Peer]]:
@@ -93,7 +67,6 @@ class UdpListener:
             self.dropped += 1
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
     def _to_socket(self, peer: tuple[str, int]) -> tuple[str, int] | tuple[str, int, int, int]:
@@ -158,7 +131,8 @@ class SerialPort(_Stream, SerialStream):
         super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
 
 
-_KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] = {
+MavlinkConnection = UdpListener | TcpClient | SerialPort
+_KINDS: Final[dict[ConnectionKind, type[MavlinkConnection]]] = {
     ConnectionKind.UDP_IN: UdpListener,
     ConnectionKind.UDP_OUT: UdpSender,
     ConnectionKind.TCP: TcpClient,

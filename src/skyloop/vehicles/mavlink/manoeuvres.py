@@ -12,9 +12,8 @@ from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, ThrustModel
 from skyloop.vehicles.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 # Frames in SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
 WORLD: Final = 1
@@ -63,7 +62,6 @@ class PositionHold:
         self._position: Vector | None = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due."""
         slow = vehicle.velocity is not None and math.hypot(*vehicle.velocity) < STOPPED_M_S
         late = seconds(now_ns - self._begun_ns) > STOPPING_S
         if self._position is None and vehicle.position is not None and (slow or late):
@@ -82,7 +80,6 @@ class VelocitySetpoint:
         self.action = action
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:  # noqa: ARG002
-        """Return the set-point if one is due."""
         return velocity_message(self.action, target)
 
 
@@ -169,7 +166,6 @@ class AttitudeSetpoint:
         return Attitude(action.roll, action.pitch, self._thrust.limit_climb(action.climb), action.yaw_rate)
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due."""
         action = self.action
         step_s = 0.0 if self._before_ns is None else min(MOST_STEP_S, seconds(now_ns - self._before_ns))
         self._before_ns = now_ns
@@ -210,13 +206,8 @@ class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
     Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request.
-
-    Args:
-        autopilot: The autopilot's profile.
-        height_m: Height above the start.
-        now_ns: Start of the take-off.
-        disarms: Whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
+    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request,
+    ``disarms`` whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:

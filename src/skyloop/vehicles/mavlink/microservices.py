@@ -11,14 +11,14 @@ from typing import Final
 from skyloop.clock import LiveClock, nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
-from skyloop.messages import EventKind, Severity, Value
+from skyloop.drivers.vehicle_session import message as event_of
+from skyloop.messages import Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.options import Peer, PoseMessage
 from skyloop.vehicles.mavlink.telemetry import Telemetry
 from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Autopilot
 
 MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may have moved to another port
 MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
@@ -40,10 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Args:
-        system: System id of the vehicle; None selects the first one found and keeps to that system from then on.
-        peer: Address and port of the vehicle; None for any.
-        component: Component id of the vehicle.
+    Without a system id it selects the first one found and keeps to that system from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -70,13 +67,11 @@ class VehicleSelector:
                 self.chosen, self._received_ns = found, now_ns
                 self._elsewhere.clear()
                 text = f"the vehicle now sends from UDP port {found.peer[1] if found.peer else 0}"
-                return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, data={"reason": "moved"})]
+                return [event_of(text, "moved")]
         if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
             return []
-        if found.component != self._component:
-            return self._report_component(found)
         suits = self.system in (None, found.system) and self._wanted_peer in (None, peer)
-        if self.chosen is None and suits:
+        if self.chosen is None and suits and found.component == self._component:
             self.chosen, self.system, self._received_ns = found, found.system, now_ns
             return []
         return self._report_other(found)
@@ -106,31 +101,23 @@ class VehicleSelector:
         self._elsewhere.clear()
 
     def _report_other(self, found: VehicleIdentity) -> list[VehicleEvent]:
+        """Report another vehicle or component, once."""
         if found in self._reported or len(self._reported) >= MOST_OTHERS:
             return []
         self._reported.add(found)
+        if found.component != self._component:
+            text = (
+                f"an autopilot answers as component {found.component} of system {found.system}, not as component "
+                f"{self._component}: ignored; ?component={found.component} chooses it"
+            )
+            return [event_of(text, "component", Severity.WARNING, system=found.system, component=found.component)]
         where = f" at {found.peer[0]}:{found.peer[1]}" if found.peer is not None else ""
         text = f"another vehicle answers, system {found.system}{where}: ignored"
         if self.chosen is not None and found.system == self.chosen.system:
             text += "; ?peer=HOST:PORT distinguishes two with one id"
         else:
             text += f"; ?sysid={found.system} chooses it"
-        return [
-            VehicleEvent(
-                EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "another", "system": found.system}
-            )
-        ]
-
-    def _report_component(self, found: VehicleIdentity) -> list[VehicleEvent]:
-        if found in self._reported or len(self._reported) >= MOST_OTHERS:
-            return []
-        self._reported.add(found)
-        text = (
-            f"an autopilot answers as component {found.component} of system {found.system}, not as component "
-            f"{self._component}: ignored; ?component={found.component} chooses it"
-        )
-        data: dict[str, Value] = {"reason": "component", "system": found.system, "component": found.component}
-        return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data)]
+        return [event_of(text, "another", Severity.WARNING, system=found.system)]
 
 
 def _is_vehicle(heartbeat: Message) -> bool:
@@ -150,15 +137,7 @@ def unsupported_reason(heartbeat: Message) -> str:
 
 ACCEPTED: Final = 0
 IN_PROGRESS: Final = 5
-_RESULTS: Final = {
-    0: "accepted",
-    1: "temporarily rejected",
-    2: "denied",
-    3: "unsupported",
-    4: "failed",
-    5: "in progress",
-    6: "cancelled",
-}
+_RESULTS: Final = ("accepted", "temporarily rejected", "denied", "unsupported", "failed", "in progress", "cancelled")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +150,7 @@ class VehicleCommand:
 
 def result_name(result: int) -> str:
     """Return a ``MAV_RESULT`` as words."""
-    return _RESULTS.get(result, f"result {result}")
+    return _RESULTS[result] if 0 <= result < len(_RESULTS) else f"result {result}"
 
 
 class CommandSender:

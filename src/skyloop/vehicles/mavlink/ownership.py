@@ -57,15 +57,7 @@ class FlightOwnership:
     def check(self, action: AnyAction, now_ns: int, *, new: bool) -> None:
         """Refuse an action that would take the vehicle from another operator without a new decision to do so.
 
-        Repeating the same action in a loop does not count as a new decision.
-
-        Args:
-            action: The requested action.
-            now_ns: The present time.
-            new: Whether an application newly requested it.
-
-        Raises:
-            DriverError: Another operator has the vehicle.
+        Repeating the same action in a loop does not count as a new decision. Raises :class:`DriverError`.
         """
         (_, at_ns), self._applied = self._applied, (type(action), now_ns)
         if not self.left_to:
@@ -81,11 +73,7 @@ class FlightOwnership:
     def take(self, action: AnyAction, vehicle: VehicleState | None, *, alone: bool, new: bool) -> None:
         """Record that the vehicle is now under our control through this action.
 
-        Args:
-            action: The accepted action.
-            vehicle: The vehicle's state; None while nothing is received.
-            alone: Whether a failsafe requested it while no pilot was in command.
-            new: Whether an application newly requested it.
+        ``alone``: a failsafe requested it while no pilot was in command; ``new``: an application newly requested it.
         """
         begins = not self._steering or not isinstance(action, _SET_POINTS)
         if alone or (new and begins):

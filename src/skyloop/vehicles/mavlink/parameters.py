@@ -78,7 +78,6 @@ class ParameterExchange:
 
     @property
     def values(self) -> dict[str, float]:
-        """All values by the autopilot's own names."""
         return {name: held.value for name, held in self.reported.items()}
 
     @property
@@ -87,7 +86,6 @@ class ParameterExchange:
         return bool(self._writes) or (self._wanted and not self.complete and not self.given_up)
 
     def on_value(self, message: Message, now_ns: int) -> None:
-        """Handle a ``PARAM_VALUE``."""
         name, kind = message.param_id, message.param_type
         try:
             value = from_field(message.param_value, kind, bytewise=self.bytewise)
@@ -291,20 +289,11 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
     else:
         least, most = -math.inf, math.inf
         value, kind = rounded(held.value), ParameterType.FLOAT
-    low = meaning.low if meaning.low is not None else least
-    high = meaning.high if meaning.high is not None else most
-    return VehicleParameter(
-        Parameter(
-            name,
-            kind,
-            value,
-            meaning.unit,
-            _bound(min(low, value)),  # a value outside the range shows that the vehicle's own is wider
-            _bound(max(high, value)),
-            description=meaning.text or f"the autopilot's {held.name}",
-        ),
-        held.name,
-    )
+    # A value outside the range shows that the vehicle's own is wider.
+    low = _bound(min(meaning.low if meaning.low is not None else least, value))
+    high = _bound(max(meaning.high if meaning.high is not None else most, value))
+    text = meaning.text or f"the autopilot's {held.name}"
+    return VehicleParameter(Parameter(name, kind, value, meaning.unit, low, high, description=text), held.name)
 
 
 def _bound(value: float) -> float | None:
@@ -313,18 +302,10 @@ def _bound(value: float) -> float | None:
 
 def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
     """Return the driver's own limits as parameters with their current values."""
+    kind = ParameterType.FLOAT
     return [
-        Parameter(
-            limit.name,
-            ParameterType.FLOAT,
-            values[limit.name],
-            limit.unit,
-            limit.low,
-            limit.high,
-            limit.usual,
-            description=limit.text,
-        )
-        for limit in OWN_LIMITS
+        Parameter(each.name, kind, values[each.name], each.unit, each.low, each.high, each.usual, description=each.text)
+        for each in OWN_LIMITS
     ]
 
 

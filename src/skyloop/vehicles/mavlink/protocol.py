@@ -18,6 +18,7 @@ from skyloop.drivers.vehicle_session import (
     serial_trouble,
     trouble_of,
 )
+from skyloop.drivers.vehicle_session import message as event_of
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, Idle, LinkState, Severity, Takeoff, Value
 from skyloop.messages.feedback import WAKING_UP
@@ -474,8 +475,7 @@ class MavlinkSession(VehicleSession):
         """Set up a new vehicle, discarding everything known about any other."""
         if self._kind is not None:
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
-            data: dict[str, Value] = {"reason": "another", "system": heartbeat.get_srcSystem()}
-            self._publish_event(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data))
+            self._publish_event(event_of(text, "another", Severity.WARNING, system=heartbeat.get_srcSystem()))
         self._kind = heartbeat.autopilot, heartbeat.type
         self.telemetry, self.parameters, self._health = Telemetry(), ParameterExchange(), HealthMonitor()
         self.parameters.target = self.commands.target
@@ -494,9 +494,7 @@ class MavlinkSession(VehicleSession):
             self.setpoints = SetpointController(
                 found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values), self._stop
             )
-            self._publish_event(
-                VehicleEvent(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"})
-            )
+            self._publish_event(event_of(limits_text(self.limits), "limits"))
 
     def _on_version(self, version: Message, now_ns: int) -> None:
         """Handle the vehicle's version. A vehicle found again counts as the same only if its version proves that."""

@@ -46,9 +46,8 @@ from skyloop.vehicles.mavlink.manoeuvres import (
 from skyloop.vehicles.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.vehicles.mavlink.ownership import FlightOwnership
 from skyloop.vehicles.mavlink.telemetry import VehicleState
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
@@ -73,12 +72,7 @@ class Goal(Enum):
 class SetpointController:
     """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
-    Args:
-        autopilot: The autopilot's profile.
-        commands: Sender of commands to the vehicle.
-        takeoff_m: Height of a take-off above its start.
-        make_thrust: Creates the thrust model for a flight by attitude.
-        stop: A motor stop that may already be active; None for a new one.
+    ``make_thrust`` creates the thrust model for a flight by attitude; ``stop`` may be active already.
     """
 
     def __init__(
@@ -116,23 +110,12 @@ class SetpointController:
     def apply(
         self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
     ) -> AnyAction:
-        """Accept an action.
+        """Accept an action; return the action in force, which is idle if it is ignored.
 
         While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`), a take-off is refused
-        and all other actions are ignored.
-
-        Args:
-            action: The requested action.
-            vehicle: The vehicle's state; None while nothing is being received.
-            now_ns: The present time.
-            alone: Whether a failsafe requested it while no pilot was in command.
-            new: Whether an application newly requested it; False for the library's repeats.
-
-        Returns:
-            The action in force; idle if it is ignored.
-
-        Raises:
-            DriverError: The action is not possible now, or another operator has the vehicle.
+        and all other actions are ignored. ``alone``: a failsafe requested it while no pilot was in command; ``new``: an
+        application newly requested it, so that it is none of the library's repeats. Raises :class:`DriverError` if the
+        action is not possible now, or another operator has the vehicle.
         """
         if isinstance(action, Idle):
             return action
@@ -325,19 +308,15 @@ class SetpointController:
     # Messages ----------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
         """Return the set-points that are due, and pass commands to the command sender.
 
-        Args:
-            vehicle: The newest state.
-            now_ns: The present time.
-            read: Whether the vehicle seems to read commands promptly, judging by its messages. If not, a set-point
-                might wait in a buffer and be followed late, so instead of a changed velocity only a stop is sent,
-                which is harmless even if late.
+        ``read`` says whether the vehicle seems to read commands promptly, judging by its messages. If not, a set-point
+        might wait in a buffer and be followed late, so instead of a changed velocity only a stop is sent, which is
+        harmless even if late.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None

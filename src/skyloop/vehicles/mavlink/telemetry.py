@@ -14,8 +14,7 @@ from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.feedback import EarthOrigin
 from skyloop.messages.geometry import turned
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message, Texts
-from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message, ModeFlag, SystemState, Texts
 
 FLOWING_S: Final = 1.0  #: attitude, position and velocity older than this count as unknown
 SLOW_S: Final = 6.0  #: corresponding limit for slow messages such as battery and GPS

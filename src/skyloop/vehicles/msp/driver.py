@@ -42,8 +42,6 @@ class MspDriver(Driver):
         """Return the driver's capabilities."""
         return Capabilities(vehicle="msp", actions=ACTIONS, description=f"a flight controller on {self.options}")
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         if self.options.serial:
             try:
@@ -66,8 +64,6 @@ class MspDriver(Driver):
         if self._link is not None:
             self._link.stop()
         self._link = None
-
-    # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
         return self._opened().command(action)
@@ -98,8 +94,6 @@ class MspDriver(Driver):
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
         return self._link
-
-    # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
         """Return the driver's own limits, scales, gains and AUX channels."""

@@ -9,9 +9,8 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 from skyloop.errors import DecodeError
 from skyloop.messages.parameter import Diagnostic
@@ -29,19 +28,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     rate_curve,
     share_of,
 )
-from skyloop.vehicles.msp.wire.messages import (
-    BETAFLIGHT,
-    INAV,
-    RX_MSP,
-    USUAL_MAP,
-    CellVoltages,
-    FailsafeConfig,
-    Function,
-    Identity,
-    ModeRange,
-    OnLoss,
-    RxConfig,
-)
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Identity, ModeRange
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
@@ -67,15 +54,15 @@ class Setup:
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
     sticks_known: bool = False  #: whether those positions were reported and are not a guess
-    rx: RxConfig = field(default_factory=RxConfig)
-    failsafe: FailsafeConfig | None = None
+    rx: msp.RxConfig = field(default_factory=msp.RxConfig)
+    failsafe: msp.FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
     features: int | None = None
     rates: Rates | None = None
     inav_yaw_rate_deg_s: float | None = None
     inav_expo: tuple[int, int] = (0, 0)  #: INAV's expo for roll and pitch, and for yaw
     angle_limit_deg: float | None = None
-    cells: CellVoltages = field(default_factory=CellVoltages)
+    cells: msp.CellVoltages = field(default_factory=msp.CellVoltages)
     receiver_is_msp: bool | None = None  #: whether MSP is the receiver; reported only by INAV
 
     # Modes -------------------------------------------------------------------------------------------------------
@@ -204,7 +191,7 @@ class Setup:
     def _receiver(self, override: bool) -> list[Diagnostic]:
         is_msp = self.receiver_is_msp
         if self.identity.variant == BETAFLIGHT and self.features is not None:
-            is_msp = bool(self.features & RX_MSP)
+            is_msp = bool(self.features & msp.RX_MSP)
         if is_msp is None:
             return []
         if override:
@@ -247,7 +234,7 @@ class Setup:
         held = [
             name
             for name, (mode, _) in zip(("roll", "pitch", "yaw", "throttle"), self.on_loss, strict=False)
-            if mode == OnLoss.HOLD
+            if mode == msp.OnLoss.HOLD
         ]
         if held:
             detail = f"without sticks it holds the last {', '.join(held)}: it would fly on"
@@ -270,12 +257,13 @@ _INAV_TUNING: Final = 7  # number of bytes in RC_TUNING up to the yaw rate
 _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
-class Identification:
-    """Requests everything that :class:`Setup` contains.
+Read = Callable[[Setup, bytes], dict[str, Any]]  #: the settings that a reply changes; raises DecodeError
 
-    Args:
-        questions: The queue of requests.
-        done: Called at the end. The setup's variant is empty if the flight controller did not identify itself.
+
+class Identification:
+    """Requests everything that :class:`Setup` contains, then calls ``done``.
+
+    The setup's variant is empty if the flight controller did not identify itself.
     """
 
     def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:
@@ -283,114 +271,68 @@ class Identification:
         self.missing: list[str] = []  #: unreadable settings that are needed before any sticks can be sent
         self._questions = questions
         self._done = done
-        for function, handler in (
-            (Function.API_VERSION, self._on_api),
-            (Function.FC_VARIANT, self._on_variant),
-            (Function.FC_VERSION, self._on_version),
-            (Function.BOARD_INFO, self._on_board),
-        ):
-            questions.ask(function, _reading(handler))
-
-    def _identify(self, **known: object) -> None:
-        self.setup = replace(self.setup, identity=replace(self.setup.identity, **known))  # type: ignore[arg-type]
-
-    def _on_api(self, payload: bytes) -> None:
-        self._identify(api=msp.api_version(payload))
-
-    def _on_variant(self, payload: bytes) -> None:
-        self._identify(variant=msp.text(payload, 4))
-
-    def _on_version(self, payload: bytes) -> None:
-        self._identify(version=msp.version(payload))
-
-    def _on_board(self, payload: bytes | None) -> None:
-        if payload is not None:
-            self._identify(board=msp.board(payload))
+        self._ask(Function.API_VERSION, lambda setup, data: _identity(setup, api=msp.api_version(data)))
+        self._ask(Function.FC_VARIANT, lambda setup, data: _identity(setup, variant=msp.text(data, 4)))
+        self._ask(Function.FC_VERSION, lambda setup, data: _identity(setup, version=msp.version(data)))
+        self._ask(Function.BOARD_INFO, lambda setup, data: _identity(setup, board=msp.board(data)))
 
     def ask_settings(self) -> None:
         """Request the settings after the firmware has been identified."""
-        ask = self._questions.ask
-        for what, function, handler in (
-            ("numbers of its modes", Function.BOXIDS, self._on_box_numbers),
-            ("names of its modes", Function.BOXNAMES, self._on_box_names),
-            ("switches of its modes", Function.MODE_RANGES, self._on_ranges),
-            ("order of its sticks", Function.RX_MAP, self._on_sticks),
-        ):
-            ask(function, _reading(handler, partial(self.missing.append, what)))
-        for function, handler in (
-            (Function.RX_CONFIG, self._on_rx),
-            (Function.FAILSAFE_CONFIG, self._on_failsafe),
-            (Function.RC_TUNING, self._on_tuning),
-        ):
-            ask(function, _reading(handler))
+        ask = self._ask
+        ask(Function.BOXIDS, lambda _, data: {"boxes": tuple((number, "") for number in data)}, "numbers of its modes")
+        ask(Function.BOXNAMES, _box_names, "names of its modes")
+        ask(Function.MODE_RANGES, lambda _, data: {"ranges": tuple(msp.mode_ranges(data))}, "switches of its modes")
+        ask(Function.RX_MAP, lambda _, data: {"sticks": msp.rx_map(data), "sticks_known": True}, "order of its sticks")
+        ask(Function.RX_CONFIG, lambda _, data: {"rx": msp.RxConfig.decode(data)})
+        ask(Function.FAILSAFE_CONFIG, lambda _, data: {"failsafe": msp.FailsafeConfig.decode(data)})
+        ask(Function.RC_TUNING, _tuning)
         if self.setup.identity.variant == BETAFLIGHT:
-            ask(Function.FEATURE_CONFIG, _reading(self._on_features))
-            ask(Function.RXFAIL_CONFIG, _reading(self._on_rx_fail))
-            ask(Function.PID_ADVANCED, _reading(self._on_angle_limit))
-            ask(Function.BATTERY_CONFIG, self._on_last)
+            ask(Function.FEATURE_CONFIG, lambda _, data: {"features": msp.features(data)})
+            ask(Function.RXFAIL_CONFIG, lambda _, data: {"on_loss": tuple(msp.rx_fail(data))})
+            ask(Function.PID_ADVANCED, lambda _, data: {"angle_limit_deg": float(msp.angle_limit_deg(data))})
+            self._questions.ask(Function.BATTERY_CONFIG, self._on_last)
         else:
-            ask(Function.COMMON_SETTING, _reading(self._on_receiver_type), b"receiver_type\0")
-            ask(Function.COMMON_SETTING, self._on_last, b"max_angle_inclination_rll\0")
+            ask(
+                Function.COMMON_SETTING,
+                lambda _, data: {"receiver_is_msp": data[0] == _MSP_RECEIVER} if data else {},
+                payload=b"receiver_type\0",
+            )
+            self._questions.ask(Function.COMMON_SETTING, self._on_last, b"max_angle_inclination_rll\0")
 
-    def _on_box_numbers(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, boxes=tuple((number, "") for number in payload))
+    def _ask(self, function: Function, read: Read, needed: str = "", payload: bytes = b"") -> None:
+        """Request settings; ``needed`` names those without which no sticks can be sent."""
 
-    def _on_box_names(self, payload: bytes) -> None:
-        numbers = [number for number, _ in self.setup.boxes]
-        self.setup = replace(self.setup, boxes=tuple(zip(numbers, msp.box_names(payload), strict=False)))
+        def on_reply(reply: bytes | None) -> None:
+            if reply is not None:
+                with suppress(DecodeError):
+                    self.setup = replace(self.setup, **read(self.setup, reply))
+                    return
+            if needed:
+                self.missing.append(needed)
 
-    def _on_ranges(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, ranges=tuple(msp.mode_ranges(payload)))
-
-    def _on_sticks(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_known=True)
-
-    def _on_rx(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, rx=RxConfig.decode(payload))
-
-    def _on_failsafe(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, failsafe=FailsafeConfig.decode(payload))
-
-    def _on_tuning(self, payload: bytes) -> None:
-        if self.setup.identity.variant == BETAFLIGHT:
-            self.setup = replace(self.setup, rates=betaflight_rates(payload))
-        elif len(payload) >= _INAV_TUNING + 4:
-            # INAV: rate, expo for roll and pitch, rates of roll, pitch and yaw in 10 degrees/s, …, expo for yaw
-            expo = payload[1], payload[10]
-            self.setup = replace(self.setup, inav_yaw_rate_deg_s=payload[4] * 10.0, inav_expo=expo)
-
-    def _on_features(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, features=msp.features(payload))
-
-    def _on_rx_fail(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, on_loss=tuple(msp.rx_fail(payload)))
-
-    def _on_angle_limit(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, angle_limit_deg=float(msp.angle_limit_deg(payload)))
-
-    def _on_receiver_type(self, payload: bytes) -> None:
-        if payload:
-            self.setup = replace(self.setup, receiver_is_msp=payload[0] == _MSP_RECEIVER)
+        self._questions.ask(function, on_reply, payload)
 
     def _on_last(self, payload: bytes | None) -> None:
         if payload is not None and self.setup.identity.variant == INAV and len(payload) >= 2:
             self.setup = replace(self.setup, angle_limit_deg=int.from_bytes(payload[:2], "little") / 10)
         elif payload is not None:
             with suppress(DecodeError):
-                self.setup = replace(self.setup, cells=CellVoltages.decode(payload))
+                self.setup = replace(self.setup, cells=msp.CellVoltages.decode(payload))
         self._done(self.setup)
 
 
-def _reading(
-    handler: Callable[[bytes], None], otherwise: Callable[[], None] = lambda: None
-) -> Callable[[bytes | None], None]:
-    """Return a handler that calls ``otherwise`` if the reply is missing or unreadable."""
+def _identity(setup: Setup, **known: Any) -> dict[str, Any]:
+    return {"identity": replace(setup.identity, **known)}
 
-    def read(payload: bytes | None) -> None:
-        if payload is not None:
-            with suppress(DecodeError):
-                handler(payload)
-                return
-        otherwise()
 
-    return read
+def _box_names(setup: Setup, payload: bytes) -> dict[str, Any]:
+    return {"boxes": tuple(zip((number for number, _ in setup.boxes), msp.box_names(payload), strict=False))}
+
+
+def _tuning(setup: Setup, payload: bytes) -> dict[str, Any]:
+    if setup.identity.variant == BETAFLIGHT:
+        return {"rates": betaflight_rates(payload)}
+    if len(payload) < _INAV_TUNING + 4:
+        return {}
+    # INAV: rate, expo for roll and pitch, rates of roll, pitch and yaw in 10 degrees/s, …, expo for yaw
+    return {"inav_yaw_rate_deg_s": payload[4] * 10.0, "inav_expo": (payload[1], payload[10])}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 from skyloop.drivers.base import checked_value, reject_unknown_options
@@ -72,6 +73,11 @@ _GAINS: Final = (
 TILT: Final = "msp.full_stick.tilt"
 HOVER: Final = "msp.hover_throttle"
 AUX: Final = "msp.aux"
+#: Parameter, the controller's field (None for 0), maximum, unit and description.
+_LEARNT: Final = (
+    (TILT, "full_tilt_rad", 1.5, "rad", "lean of a full stick in ANGLE mode; 0: the flight controller's angle_limit"),
+    (HOVER, "hover", 0.9, "", "hover throttle as a share of full throttle, learnt in flight; 0: unknown"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +87,7 @@ class _Entry:
 
 
 class DriverParameters:
-    """The driver's own parameters.
-
-    Args:
-        setpoints: The controller that uses them. The caller must hold the lock that protects it.
-    """
+    """The driver's own parameters. The caller must hold the lock that protects the controller that uses them."""
 
     def __init__(self, setpoints: SetpointController) -> None:
         self._setpoints = setpoints
@@ -105,73 +107,40 @@ class DriverParameters:
         return value
 
     def _entries(self) -> dict[str, _Entry]:
-        made = [*self._limits(), *self._gains(), self._tilt(), self._hover(), *self._aux()]
+        setpoints = self._setpoints
+        made = [
+            *(self._setting("limits", f"limits.{row[0]}", Limits(), *row) for row in _LIMITS),
+            *(self._setting("gains", f"msp.{row[0]}", Gains(), *row) for row in _GAINS),
+        ]
+        for name, field, high, unit, text in _LEARNT:
+            parameter = _number(name, getattr(setpoints, field) or 0.0, 0.0, high, unit, text, 0.0)
+            made.append(_Entry(parameter, partial(self._write_learnt, field)))
+        for channel in range(MOST_AUX):
+            name, value = f"{AUX}{channel + 1}", setpoints.given_aux.get(channel, AUTOMATIC)
+            text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; not for the arm switch"
+            parameter = Parameter(name, ParameterType.INT, value, "µs", 0, 2100, default=AUTOMATIC, description=text)
+            made.append(_Entry(parameter, partial(self._write_aux, channel)))
         return {entry.parameter.name: entry for entry in made}
 
-    def _limits(self) -> list[_Entry]:
-        def writing(field: str) -> Callable[[float], None]:
-            def write(value: float) -> None:
-                self._setpoints.limits = replace(self._setpoints.limits, **{field: value})
+    def _setting(
+        self, group: str, name: str, usual: Limits | Gains, field: str, low: float, high: float, unit: str, text: str
+    ) -> _Entry:
+        """Return the entry for a field of the controller's limits or gains."""
 
-            return write
-
-        now, usual = self._setpoints.limits, Limits()
-        return [
-            _Entry(
-                _number(f"limits.{field}", getattr(now, field), low, high, unit, text, getattr(usual, field)),
-                writing(field),
-            )
-            for field, low, high, unit, text in _LIMITS
-        ]
-
-    def _gains(self) -> list[_Entry]:
-        def writing(field: str) -> Callable[[float], None]:
-            def write(value: float) -> None:
-                self._setpoints.gains = replace(self._setpoints.gains, **{field: value})
-
-            return write
-
-        now, usual = self._setpoints.gains, Gains()
-        return [
-            _Entry(
-                _number(f"msp.{field}", getattr(now, field), low, high, unit, text, getattr(usual, field)),
-                writing(field),
-            )
-            for field, low, high, unit, text in _GAINS
-        ]
-
-    def _tilt(self) -> _Entry:
         def write(value: float) -> None:
-            self._setpoints.full_tilt_rad = value or None
+            setattr(self._setpoints, group, replace(getattr(self._setpoints, group), **{field: value}))
 
-        text = "lean of a full stick in ANGLE mode; 0: the flight controller's angle_limit"
-        return _Entry(_number(TILT, self._setpoints.full_tilt_rad or 0.0, 0.0, 1.5, "rad", text, 0.0), write)
+        now = getattr(getattr(self._setpoints, group), field)
+        return _Entry(_number(name, now, low, high, unit, text, getattr(usual, field)), write)
 
-    def _hover(self) -> _Entry:
-        def write(value: float) -> None:
-            self._setpoints.hover = value or None
+    def _write_learnt(self, field: str, value: float) -> None:
+        setattr(self._setpoints, field, value or None)
 
-        text = "hover throttle as a share of full throttle, learnt in flight; 0: unknown"
-        return _Entry(_number(HOVER, self._setpoints.hover or 0.0, 0.0, 0.9, "", text, 0.0), write)
-
-    def _aux(self) -> list[_Entry]:
-        def writing(channel: int) -> Callable[[float], None]:
-            def write(value: float) -> None:
-                if value == AUTOMATIC:
-                    self._setpoints.given_aux.pop(channel, None)
-                else:
-                    self._setpoints.given_aux[channel] = int(value)
-
-            return write
-
-        text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; not for the arm switch"
-        made = []
-        for channel in range(MOST_AUX):
-            value = self._setpoints.given_aux.get(channel, AUTOMATIC)
-            name = f"{AUX}{channel + 1}"
-            parameter = Parameter(name, ParameterType.INT, value, "µs", 0, 2100, default=AUTOMATIC, description=text)
-            made.append(_Entry(parameter, writing(channel)))
-        return made
+    def _write_aux(self, channel: int, value: float) -> None:
+        if value == AUTOMATIC:
+            self._setpoints.given_aux.pop(channel, None)
+        else:
+            self._setpoints.given_aux[channel] = int(value)
 
 
 def _number(name: str, value: float, low: float, high: float, unit: str, text: str, default: float) -> Parameter:

@@ -110,7 +110,6 @@ class MspSession(VehicleSession):
         self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:
-        """End the session."""
         self._questions.clear()
 
     def final_bytes(self, now_ns: int) -> bytes:

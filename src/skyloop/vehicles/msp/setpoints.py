@@ -35,7 +35,7 @@ ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has no
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
 #: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
 PASSING: Final = frozenset(
-    {
+    (
         "RXLOSS",
         "FAILSAFE",
         "NOT_DISARMED",
@@ -45,7 +45,7 @@ PASSING: Final = frozenset(
         "RC_LINK",
         "SENSORS_CALIBRATING",
         ARM_SWITCH,
-    }
+    )
 )
 SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: more of them, in its first reports before it has an attitude
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] at a lift-off, by precision
@@ -111,8 +111,7 @@ class Report:
 class SetpointController:
     """Stores the last set-point and turns it into receiver channels.
 
-    Args:
-        override: Whether a pilot keeps a real receiver, in which case only the pilot arms.
+    With ``override`` a pilot keeps a real receiver, and only the pilot arms.
     """
 
     def __init__(self, override: bool = False) -> None:
@@ -174,18 +173,10 @@ class SetpointController:
     # Decisions -----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action.
+        """Accept one of the driver's ``ACTIONS``; return the action in force, within the limits.
 
-        Args:
-            action: One of the driver's ``ACTIONS``.
-            now_ns: The present time.
-
-        Returns:
-            The action in force, within the limits.
-
-        Raises:
-            DriverError: The vehicle is on the ground and can't be armed for this climb, or a reset was requested while
-                the motors were still running.
+        Raises :class:`DriverError` if the vehicle is on the ground and can't be armed for this climb, or a reset was
+        requested while the motors were still running.
         """
         if isinstance(action, EmergencyStop):
             self.stop.press(now_ns)
@@ -355,7 +346,6 @@ class SetpointController:
     # Sticks --------------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 

@@ -54,15 +54,12 @@ class Questions:
 
     @property
     def idle(self) -> bool:
-        """Whether there are no more questions."""
         return not self._queue
 
     def ask(self, function: int, handler: Handler, payload: bytes = b"") -> None:
-        """Queue a question."""
         self._queue.append((Frame(function, payload), handler))
 
     def clear(self) -> None:
-        """Discard all questions without calling their handlers."""
         self._queue.clear()
         self._sent_ns = None
 
@@ -100,23 +97,18 @@ class Stream:
 
     @property
     def frame(self) -> Frame:
-        """The request frame."""
         if len(self.functions) > 1:
             return Frame(Function.MULTIPLE, bytes(self.functions))
         return Frame(self.functions[0])
 
 
 class Telemetry:
-    """Requests states at their rates, a few at a time.
+    """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
-    in its buffers, and so would the sticks behind them. A reply to ``MULTIPLE`` does not say what it contains, so there
-    is only one bundle: if a reply is lost, the next one can't be mistaken for it.
-
-    Args:
-        streams: Rates in hertz by function.
-        bundle: Functions requested together, at the rate of the first one, from firmware that supports ``MULTIPLE``.
-        most: Maximum number of unanswered requests.
+    in its buffers, and so would the sticks behind them: at most ``most`` are unanswered. A reply to ``MULTIPLE``, which
+    newer firmware supports, does not say what it contains, so there is only one ``bundle``, requested at the rate of
+    its first function: if a reply is lost, the next one can't be mistaken for it.
     """
 
     def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:
@@ -246,7 +238,6 @@ class MotionEstimate:
         return EarthOrigin(first.latitude_deg, first.longitude_deg, first.altitude_m, EARTH_RADIUS_M)
 
     def on_pose(self, pose: ExternalPose) -> None:
-        """Handle an external pose."""
         self._filter.update(pose.position_m, pose.captured_ns)
         if self._pose is None or pose.captured_ns > self._pose.captured_ns:
             self._pose = pose
@@ -254,11 +245,9 @@ class MotionEstimate:
                 self._turned_rad = wrap_angle(_yaw(pose) - self._heading_rad)
 
     def on_attitude(self, attitude: Attitude) -> None:
-        """Handle the flight controller's attitude."""
         self._heading_rad = wrap_angle(math.pi / 2 - math.radians(attitude.heading_deg))
 
     def on_altitude(self, altitude: Altitude, now_ns: int) -> None:
-        """Handle the flight controller's altitude."""
         self._altitude = altitude, now_ns
 
     def on_gps(self, gps: Gps, now_ns: int) -> None:

@@ -13,21 +13,10 @@ from skyloop.drivers.base import Driver, Sink, reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.files import expand
-from skyloop.messages import (
-    AnyAction,
-    Capabilities,
-    EventKind,
-    Hover,
-    Land,
-    LinkState,
-    Parameter,
-    Severity,
-    Value,
-)
+from skyloop.messages import AnyAction, Capabilities, EventKind, Hover, Land, LinkState, Parameter, Severity, Value
 from skyloop.recording.layout import DroneRecord
 from skyloop.recording.reader import Recording
-from skyloop.vehicles.replay.playback import NAMES, SPEEDS, Playback
-from skyloop.vehicles.replay.player import PREFIX, Player, ReplayPublisher, StepPlayer
+from skyloop.vehicles.replay.player import NAMES, PREFIX, SPEEDS, Playback, Player, ReplayPublisher, StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
@@ -74,7 +63,7 @@ class ReplayDriver(Driver):
         return [*recorded, *playback.parameters()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Move, pause or slow down the replay; see :class:`skyloop.vehicles.replay.playback.Playback`."""
+        """Move, pause or slow down the replay; see :class:`skyloop.vehicles.replay.player.Playback`."""
         if self._playback is None or name.startswith(PREFIX):
             return super().set_parameter(name, value)
         return self._playback.set(name, value)

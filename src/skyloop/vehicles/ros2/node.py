@@ -123,14 +123,9 @@ def ros_name(name: str) -> str:
 class RosContext:
     """An rclpy context, its nodes, and the threads that run their callbacks.
 
-    Args:
-        purpose: The purpose of rclpy, stated in the error if it is missing.
-        domain: DDS domain; None to use ``ROS_DOMAIN_ID``.
-        arguments: Arguments for ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
-
-    Raises:
-        MissingExtraError: rclpy is not installed.
-        UsageError: rclpy rejects the arguments.
+    ``domain`` is None to use ``ROS_DOMAIN_ID``; ``arguments`` are those of ROS 2, such as ``-r cmd_vel:=/cmd_vel``,
+    without ``--ros-args``. Raises :class:`MissingExtraError`, stating the purpose, if rclpy is missing, and
+    :class:`UsageError` if it rejects the arguments.
     """
 
     def __init__(self, purpose: str, domain: int | None = None, arguments: Iterable[str] = ()) -> None:

@@ -30,14 +30,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.vehicles.ros2.options import Options
-from skyloop.vehicles.ros2.wire import (
-    euler_of,
-    intrinsics_of,
-    levelled_velocity,
-    nanoseconds_of,
-    pixels_of,
-    skew_of,
-)
+from skyloop.vehicles.ros2.wire import euler_of, intrinsics_of, levelled_velocity, nanoseconds_of, pixels_of, skew_of
 
 PERIOD_S: Final = 0.05  #: time between repeats of a velocity, because robots stop if they receive none
 AIRBORNE_M: Final = 0.1  #: height in the odometry above which a robot counts as flying
@@ -160,14 +153,8 @@ class RobotSession:
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
         """Accept an action that is among the capabilities.
 
-        Args:
-            action: The action.
-            new: Whether an application has just requested it. A repeated take-off or landing does not call the service
-                again.
-
-        Raises:
-            DriverError: The robot does not offer the service, is silent when asked to take off, or has already refused
-                this take-off.
+        A repeated take-off or landing (not ``new``) does not call the service again. Raises :class:`DriverError` if the
+        robot does not offer the service, is silent when asked to take off, or has already refused this take-off.
         """
         with self._lock:
             if isinstance(action, Velocity):

@@ -62,9 +62,6 @@ class ClockMap:
 
     The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that the intervals between
     stamps equal those between captures. A larger error means that a clock was set, or that ROS time is simulated.
-
-    Args:
-        tolerance_s: Greatest error with which the offset is kept [s].
     """
 
     def __init__(self, tolerance_s: float = 1e-3) -> None:
@@ -142,13 +139,7 @@ def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` as first number.
-
-    Args:
-        size: Number of rows.
-        known: Whether the quantity was measured.
-        variance: The variance, in the square of the quantity's unit.
-    """
+    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` as first number."""
     found = [0.0] * (size * size)
     if not known:
         found[0] = NOT_KNOWN
@@ -245,10 +236,8 @@ ENCODINGS: Final = (*_PIXELS, _WIDE, *_CONVERTED)
 def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
     """Return the pixels of a ``sensor_msgs/Image`` as C-contiguous uint8 without padding, and their encoding.
 
-    16-bit values are reduced to their upper eight bits.
-
-    Raises:
-        DecodeError: The encoding is unknown, the size does not fit the data, or OpenCV is missing.
+    16-bit values are reduced to their upper eight bits. Raises :class:`DecodeError` if the encoding is unknown, the
+    size does not fit the data, or OpenCV is missing.
     """
     given = image.encoding if image.encoding in _PIXELS else str(image.encoding).lower()
     if given in _PIXELS:

@@ -109,8 +109,6 @@ class SimDriver(Driver):
             description=f"a simulated drone in the world {self.options.world!r}, seed {self.options.seed}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         host = self.host if self._shared else SimHost(self.options)
         assert host is not None
@@ -142,8 +140,6 @@ class SimDriver(Driver):
         if self._setpoints is None:
             return limits
         return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
-
-    # Flying ----------------------------------------------------------------------------------------------------
 
     def _apply(self, action: AnyAction) -> AnyAction:
         if self._firmware is not None:
@@ -187,8 +183,6 @@ class SimDriver(Driver):
             return self._setpoints.command(action)
         return host.simulation.command(self.drone, action)
 
-    # Parameters ------------------------------------------------------------------------------------------------
-
     def parameters(self) -> list[Parameter]:
         """Return limits, cameras, battery, wind, the radio link, the room and the objects in it."""
         world = self._known_world()
@@ -197,12 +191,7 @@ class SimDriver(Driver):
         return [*table.describe(self._present(), self._standard()), *surroundings, *firmware]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. The wind is shared by the whole world.
-
-        Raises:
-            UnknownNameError: There is no parameter with this name.
-            ParameterError: The value is invalid.
-        """
+        """Write a parameter; raise an error for an unknown name or an invalid value. The wind is the whole world's."""
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
         with self._changing:
@@ -307,12 +296,7 @@ class SimDriver(Driver):
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
-                model.name,
-                pixels,
-                captured_ns,
-                width=model.width,
-                height=model.height,
-                intrinsics=model.intrinsics(),
+                model.name, pixels, captured_ns, width=model.width, height=model.height, intrinsics=model.intrinsics()
             )
 
     def failed(self, error: Exception) -> None:

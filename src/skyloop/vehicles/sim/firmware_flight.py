@@ -7,11 +7,9 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.base import Driver, ExternalPose, Sink
@@ -20,10 +18,8 @@ from skyloop.errors import DriverError, UnsupportedError
 from skyloop.messages import (
     AnyAction,
     Capabilities,
-    Encoding,
     EventKind,
     Feedback,
-    Intrinsics,
     LinkState,
     Severity,
     Value,
@@ -34,30 +30,21 @@ from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.sim.rotor_dynamics import rotors_of
 from skyloop.vehicles.sim.firmware import AutopilotKind
-from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import CoupledFirmware, FirmwareEvent, FirmwareEventKind
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
 #: Addresses for drivers that are not opened, because capabilities do not depend on the address.
 _SOMEWHERE: Final = {
-    AutopilotKind.ARDUPILOT: "mavlink://udpin:127.0.0.1:14550",
+    **dict.fromkeys((AutopilotKind.ARDUPILOT, AutopilotKind.PX4), "mavlink://udpin:127.0.0.1:14550"),
     AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
-    AutopilotKind.PX4: "mavlink://udpin:127.0.0.1:14550",
 }
 _NAMES: Final = {
     AutopilotKind.ARDUPILOT: "ArduCopter",
     AutopilotKind.BETAFLIGHT: "Betaflight",
     AutopilotKind.PX4: "PX4",
 }
-_SEVERITIES: Final = {
-    FirmwareEventKind.STARTED: Severity.INFO,
-    FirmwareEventKind.ANSWERS: Severity.INFO,
-    FirmwareEventKind.SILENT: Severity.ERROR,
-    FirmwareEventKind.DIED: Severity.ERROR,
-    FirmwareEventKind.FAILED: Severity.ERROR,
-    FirmwareEventKind.DEAF: Severity.INFO,
-}
+_ERRORS: Final = (FirmwareEventKind.SILENT, FirmwareEventKind.DIED, FirmwareEventKind.FAILED)
 _KEPT_REPORTS: Final = 64  # number of reports kept, to find the truth at the time of delayed feedback
 _POSE_STD_M: Final = 0.001  # standard deviation that is stated for the true position
 #: Greatest age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
@@ -169,7 +156,8 @@ class FirmwareFlight:
     def _happened(self, event: FirmwareEvent) -> None:
         sink = self._sink
         if sink is not None:
-            sink.event(EventKind.VEHICLE_MESSAGE, event.text, _SEVERITIES[event.kind], reason=f"firmware_{event.kind}")
+            severity = Severity.ERROR if event.kind in _ERRORS else Severity.INFO
+            sink.event(EventKind.VEHICLE_MESSAGE, event.text, severity, reason=f"firmware_{event.kind}")
         if event.kind is FirmwareEventKind.STARTED:
             self._open_driver()
         elif event.kind is FirmwareEventKind.FAILED and sink is not None and not self._found:
@@ -235,40 +223,18 @@ class _InnerSink:
     def feedback(self, feedback: Feedback) -> None:
         self._sink.feedback(self._flight.with_truth(feedback))
 
-    def frame(
-        self,
-        camera: str,
-        pixels: NDArray[np.uint8],
-        captured_ns: int,
-        *,
-        width: int,
-        height: int,
-        encoding: Encoding = Encoding.BGR8,
-        intrinsics: Intrinsics | None = None,
-    ) -> None:
+    def frame(self, *_: Any, **__: Any) -> None:
         raise NotImplementedError  # the simulated cameras' images take another path
+
+    stream = frame
 
     def wants(self, camera: str) -> bool:  # noqa: ARG002
         return False
 
+    wants_stream = wants
+
     def wanted_fps(self, camera: str) -> float:  # noqa: ARG002
         return 0.0
-
-    def stream(
-        self,
-        camera: str,
-        data: bytes,
-        captured_ns: int,
-        *,
-        width: int,
-        height: int,
-        key: bool,
-        intrinsics: Intrinsics | None = None,
-    ) -> None:
-        raise NotImplementedError
-
-    def wants_stream(self, camera: str) -> bool:  # noqa: ARG002
-        return False
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:  # noqa: ARG002
         self._sink.link(*self._flight.link(state, reason))

@@ -1,19 +1,4 @@
-"""Options in a ``sim://`` address. Pure.
-
-The options, with defaults in parentheses: ``world``, a name or file (``room``); ``seed`` (0); ``speed``, simulated
-seconds per second (1); ``cameras``, which can also be ``fpv`` (a racer's, wide and tilted up) or ``none``
-(``front,bottom``); ``width``, ``height`` and ``fps`` of all cameras; ``latency`` of all cameras [s]; ``noise``, a
-factor for the noise of all sensors and cameras (1); ``wind``, a factor for the world's wind (1); ``battery``, the
-initial charge, 0 to 1 (1); ``quality`` of the cameras' images, ``fast``, ``smooth`` or ``best`` (``smooth``);
-``native``, the actions that the vehicle provides itself, leaving the others to the proxy (all); ``position``, whether
-the vehicle knows its position, as with an indoor positioning system, or ``none`` (1); ``velocity``, whether it reports
-its velocity, or ``none`` (1); ``truth``, whether feedback also contains the true state (1); ``rate`` of feedback [1/s]
-(40); ``vehicle``, with an identified response, ``quadrotor`` or ``ardrone``, or modelled down to its rotors, ``racer``,
-``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot``, the real firmware that flies it, ``ardupilot``,
-``betaflight`` or ``px4`` (none), by default on an ``iris``, or on a ``racer`` for Betaflight; ``autopilot_folder``, the
-folder for its settings (by default they last as long as the drone). With ``autopilot``, ``rate`` and all options not
-listed here are those of the firmware's driver, ``mavlink://`` or ``msp://``.
-"""
+"""Options in a ``sim://`` address, listed in ``docs/drivers.md``. Pure."""
 
 from __future__ import annotations
 

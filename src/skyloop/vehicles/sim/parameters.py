@@ -75,12 +75,7 @@ def geometry(world: World) -> Parameter:
 
 
 def with_value(state: ParameterValues, name: str, value: Value) -> tuple[ParameterValues, Value]:
-    """Return the values after writing one of them, and that value as written.
-
-    Raises:
-        UnknownNameError: There is no parameter with this name.
-        ParameterError: The value is invalid.
-    """
+    """Return the values after writing one of them, and that value as written; raise if the name or value is invalid."""
     group = _GROUPS.get(name.partition(".")[0])
     for entry in group(state, state) if group is not None else ():
         if entry.parameter.name == name:
@@ -140,42 +135,19 @@ def _with_camera(at: int, field: str, before: ParameterValues, value: Any) -> Pa
 
 
 def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
+    now, usual = state.wind, standard.wind
+    text = "mean wind, as the direction it blows to: east, north and up"
     wind = Parameter(
-        name="sim.wind",
-        type=ParameterType.VECTOR,
-        value=state.wind.mean_m_s,
-        unit="m/s",
-        minimum=-20.0,
-        maximum=20.0,
-        default=standard.wind.mean_m_s,
-        description="mean wind, as the direction it blows to: east, north and up",
+        "sim.wind", ParameterType.VECTOR, now.mean_m_s, "m/s", -20.0, 20.0, usual.mean_m_s, description=text
     )
-    gust = Parameter(
-        name="sim.gust",
-        type=ParameterType.FLOAT,
-        value=state.wind.gust_m_s,
-        unit="m/s",
-        minimum=0.0,
-        maximum=10.0,
-        default=standard.wind.gust_m_s,
-        description="standard deviation of gusts",
-    )
+    text = "standard deviation of gusts"
+    gust = Parameter("sim.gust", ParameterType.FLOAT, now.gust_m_s, "m/s", 0.0, 10.0, usual.gust_m_s, description=text)
+    text = "remaining charge, 0 to 1"
     battery = Parameter(
-        name="sim.battery",
-        type=ParameterType.FLOAT,
-        value=state.battery,
-        minimum=0.0,
-        maximum=1.0,
-        default=standard.battery,
-        description="remaining charge, 0 to 1",
+        "sim.battery", ParameterType.FLOAT, state.battery, "", 0.0, 1.0, standard.battery, description=text
     )
-    link = Parameter(
-        name="sim.link",
-        type=ParameterType.BOOL,
-        value=state.link,
-        default=True,
-        description="whether the drone's radio works; without it no data arrives and commands are lost",
-    )
+    text = "whether the drone's radio works; without it no data arrives and commands are lost"
+    link = Parameter("sim.link", ParameterType.BOOL, state.link, default=True, description=text)
     return [
         _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=value))),
         _Settable(gust, lambda before, value: replace(before, wind=replace(before.wind, gust_m_s=value))),

@@ -14,12 +14,9 @@ from skyloop.sim.world import Vec3
 
 
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
-    """Convert a report to feedback.
+    """Convert a report to feedback; the options say whether it has the position, the velocity and the truth.
 
-    Args:
-        report: The drone's estimated and true state, on this host's clock.
-        state: The flight state to report, which is less detailed for a vehicle that flies by set-points alone.
-        options: Whether the vehicle reports its position, its velocity and the truth.
+    ``state`` is the flight state to report, which is less detailed for a vehicle that flies by set-points alone.
     """
     believed = report.believed
     native = native_of(report, options)

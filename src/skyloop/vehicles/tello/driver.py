@@ -50,8 +50,6 @@ class TelloDriver(Driver):
             description=f"a Ryze Tello at {self.options.host}",
         )
 
-    # Life cycle ------------------------------------------------------------------------------------------------
-
     def _open(self, sink: Sink) -> None:
         if self.options.video:
             TelloVideo()  # raises an error now if PyAV is not installed
@@ -78,8 +76,6 @@ class TelloDriver(Driver):
         if link.session.ready:
             self._start_video(sink, link, settings)
 
-    # Flying ----------------------------------------------------------------------------------------------------
-
     def _apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
@@ -99,8 +95,6 @@ class TelloDriver(Driver):
         with link.lock:
             return link.session.diagnose()
 
-    # Parameters ------------------------------------------------------------------------------------------------
-
     def parameters(self) -> list[Parameter]:
         """Return the parameters. Those that depend on the SDK version appear once that is known."""
         return [] if self._settings is None else self._settings.parameters()
@@ -110,8 +104,6 @@ class TelloDriver(Driver):
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)
-
-    # Video -----------------------------------------------------------------------------------------------------
 
     def _start_video(self, sink: Sink, link: TelloLink, settings: DroneSettings) -> None:
         def show(picture: Picture) -> None:

@@ -44,29 +44,28 @@ def _choice(
     return Setting(made, since, commands)
 
 
+V2, V3 = Sdk.V2_0, Sdk.V3_0
 SETTINGS: Final = {
     setting.parameter.name: setting
     for setting in (
-        _choice(
-            "tello.mission_pads", Sdk.V2_0, {True: "mon", False: "moff"}, False, "looks for mission pads (mon, moff)"
-        ),
+        _choice("tello.mission_pads", V2, {True: "mon", False: "moff"}, False, "looks for mission pads (mon, moff)"),
         _choice(
             "tello.mission_pad_direction",
-            Sdk.V2_0,
+            V2,
             {"down": "mdirection 0", "forward": "mdirection 1", "both": "mdirection 2"},
             "both",
             "where to look for mission pads (mdirection): 20 times a second, or 10 for both",
         ),
         _choice(
             CAMERA,
-            Sdk.V3_0,
+            V3,
             {FRONT: "downvision 0", BOTTOM: "downvision 1"},
             FRONT,
             "the camera whose pictures the drone sends (downvision)",
         ),
         _choice(
             "camera.fps",
-            Sdk.V3_0,
+            V3,
             {5: "setfps low", 15: "setfps middle", 30: "setfps high"},
             30,
             "pictures a second (setfps)",
@@ -74,14 +73,14 @@ SETTINGS: Final = {
         ),
         _choice(
             "camera.resolution",
-            Sdk.V3_0,
+            V3,
             {"high": "setresolution high", "low": "setresolution low"},
             "high",
             "of the front camera (setresolution)",
         ),
         _choice(
             "camera.bitrate",
-            Sdk.V3_0,
+            V3,
             {rate: f"setbitrate {rate}" for rate in range(6)},
             0,
             "of the video; 0: as the drone sees fit (setbitrate)",
@@ -89,12 +88,12 @@ SETTINGS: Final = {
         ),
     )
 }
-#: Each parameter with its field in :class:`Scale`, unit, range and description.
+#: Each field of :class:`Scale` with its unit, range and description.
 _SCALES: Final = (
-    ("speed", "speed", "m/s", (0.05, _GREATEST), "horizontal speed along each axis"),
-    ("climb", "climb", "m/s", (0.05, _GREATEST), "climb and descent"),
-    ("yaw_rate", "yaw_rate", "rad/s", (0.05, _GREATEST), "yaw rate"),
-    ("tilt", "tilt", "rad", (0.01, 1.0), "roll and pitch"),
+    ("speed", "m/s", (0.05, _GREATEST), "horizontal speed along each axis"),
+    ("climb", "m/s", (0.05, _GREATEST), "climb and descent"),
+    ("yaw_rate", "rad/s", (0.05, _GREATEST), "yaw rate"),
+    ("tilt", "rad", (0.01, 1.0), "roll and pitch"),
 )
 LIMITS: Final = "limits."
 FULL: Final = "tello.full_stick."
@@ -104,17 +103,13 @@ def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
     """Return the parameters for the largest set-points and for the effect of a full stick."""
     usual = Scale()
     made = []
-    for name, field, unit, (low, high), text in _SCALES:
+    for field, unit, (low, high), text in _SCALES:
         for prefix, scale, what in (
             (LIMITS, limits, f"greatest {text}; never more than a full stick"),
             (FULL, full, f"{text} of the drone at full stick: measure it to make set-points accurate"),
         ):
-            value, default = getattr(scale, field), getattr(usual, field)
-            made.append(
-                Parameter(
-                    f"{prefix}{name}", ParameterType.FLOAT, value, unit, low, high, default=default, description=what
-                )
-            )
+            name, value, default = f"{prefix}{field}", getattr(scale, field), getattr(usual, field)
+            made.append(Parameter(name, ParameterType.FLOAT, value, unit, low, high, default, description=what))
     return made
 
 
@@ -133,18 +128,12 @@ def flip_parameter(value: str) -> Parameter:
 
 def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
     """Return the properties that the drone reports, as read-only parameters."""
-    made = []
-    if sdk is not None:
-        made.append(
-            Parameter("tello.sdk", ParameterType.TEXT, sdk.value, read_only=True, description="of the firmware")
-        )
-    if serial:
-        made.append(
-            Parameter(
-                "tello.serial", ParameterType.TEXT, serial, read_only=True, description="the drone's number (sn?)"
-            )
-        )
-    return made
+    known = (
+        ("tello.sdk", "" if sdk is None else sdk.value, "of the firmware"),
+        ("tello.serial", serial, "the drone's number (sn?)"),
+    )
+    kind = ParameterType.TEXT
+    return [Parameter(name, kind, text, read_only=True, description=what) for name, text, what in known if text]
 
 
 def known_settings(sdk: Sdk | None) -> dict[str, Setting]:

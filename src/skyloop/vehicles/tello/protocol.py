@@ -60,11 +60,9 @@ class Conversation:
 
     @property
     def idle(self) -> bool:
-        """Whether no request is in flight or queued."""
         return self._asked is None and not self._queue
 
     def ask(self, request: Request) -> None:
-        """Queue a request."""
         self._queue.append(request)
 
     def moved(self, text: str, now_ns: int) -> None:
@@ -145,11 +143,8 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 class TelloSession(VehicleSession):
     """The protocol between an open driver and its drone. Not thread-safe.
 
-    Args:
-        options: Options of the vehicle's address.
-        now_ns: The time of opening.
-        extra: Returns further telemetry for ``Feedback.native``.
-        video_ns: Returns when usable video or a key frame last arrived; 0 if never.
+    ``extra`` returns further telemetry for ``Feedback.native``, ``video_ns`` when usable video or a key frame last
+    arrived, 0 if never.
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)

@@ -151,20 +151,12 @@ class SetpointController:
     # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action.
+        """Accept one of the driver's ``ACTIONS``.
 
-        Args:
-            action: One of the driver's ``ACTIONS``.
-            now_ns: The present time.
-            new: Whether an application has just requested it. While the drone is :attr:`left_alone`, actions other than
-                landings have no effect unless an application requested them.
-
-        Returns:
-            The applied action: a set-point within the limits, or hover after an emergency stop.
-
-        Raises:
-            DriverError: A take-off while the drone is silent or after an emergency stop, or a reset while it is silent
-                or its motors are still running.
+        While the drone is :attr:`left_alone`, actions other than landings have no effect unless an application has just
+        requested them (``new``). Returns the applied action: a set-point within the limits, or hover after an emergency
+        stop. Raises :class:`DriverError` for a take-off while the drone is silent or after an emergency stop, and for a
+        reset while it is silent or its motors are still running.
         """
         if isinstance(action, Idle):
             return action
@@ -286,7 +278,6 @@ class SetpointController:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 

@@ -127,7 +127,6 @@ class FlightWatch:
         return None if self._motor_s is None or now_ns - self._since_ns < STILL_NS else False
 
     def update(self, state: State, now_ns: int) -> None:
-        """Handle the newest state."""
         self._count(state.motor_s, now_ns)
         height = height_m(state)
         slow = state.speed_dm_s is None or abs(state.speed_dm_s[2]) <= SLOW_DM_S

@@ -106,12 +106,10 @@ class VideoStream:
 
     @property
     def broken(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.missing
 
     @property
     def lost_bytes(self) -> int:
-        """See :class:`skyloop.drivers.live_video.Stream`."""
         return self._assembly.stray
 
     def read(self) -> list[Coded]:
@@ -124,7 +122,6 @@ class VideoStream:
         return frames
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
     def _drain(self, frames: list[Coded]) -> None:
@@ -154,14 +151,9 @@ class TelloVideo:
 
     Decoding starts at an intact key frame with a decoder that rejects any damage. If concealment is allowed, a second
     decoder takes over at the first damage and decodes again from that key frame, filling gaps from the previous image.
-    After a damaged key frame, or more damaged images than allowed, nothing is shown until the next intact key frame.
-
-    Args:
-        concealed: Maximum number of damaged images on which a displayed one may depend.
-        on_whole: Called on the decoding thread with each undamaged image that depends only on undamaged ones.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
+    After a damaged key frame, or more than ``concealed`` damaged images, nothing is shown until the next intact key
+    frame. ``on_whole`` is called on the decoding thread with each undamaged image that depends only on undamaged ones.
+    Raises :class:`MissingExtraError` if PyAV is not installed.
     """
 
     def __init__(self, concealed: int = 0, on_whole: Callable[[Coded], None] = lambda _: None) -> None:
@@ -178,7 +170,6 @@ class TelloVideo:
         self._number = 0
 
     def restart(self) -> None:
-        """Wait for the next key frame."""
         self._strict = self._patching = None
 
     @property
@@ -187,7 +178,6 @@ class TelloVideo:
         return self._strict is None and self._patching is None
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         unit = coded.data
         if not isinstance(unit, AccessUnit):
             raise TypeError("expected a picture of a Tello")

@@ -23,20 +23,7 @@ from dataclasses import dataclass
 from enum import Enum, StrEnum
 from typing import Final
 
-from skyloop.drivers.h264 import (
-    IDR,
-    PPS,
-    SLICE,
-    SPS,
-    START,
-    Sequence,
-    Slice,
-    missing_between,
-    parse_sequence,
-    parse_slice,
-)
-from skyloop.drivers.h264 import unit_type as type_of
-from skyloop.drivers.h264 import units as units_of
+from skyloop.drivers import h264
 from skyloop.errors import DecodeError
 
 PORT: Final = 8889  #: the Tello's port for commands; it replies to the sender's port
@@ -262,6 +249,7 @@ def build(fields: list[tuple[str, str]]) -> bytes:
 
 PIECE: Final = 1460  #: bytes in every datagram of an image except the last one
 MAX_PICTURE: Final = 1 << 19  #: bytes; real images have a fiftieth of that
+_SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
 
@@ -296,15 +284,15 @@ class Assembly:
         self._pieces: list[bytes] = []
         self._size = 0
         self._arrived_ns = 0
-        self._sequence: Sequence | None = None
-        self._before: Slice | None = None
+        self._sequence: h264.Sequence | None = None
+        self._before: h264.Slice | None = None
         self._gap = True  # whether there was a gap since the last returned image
         self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
         """Add a datagram that arrived now; return the images that it completes, at most two."""
         found = []
-        begins = piece.startswith(START)
+        begins = piece.startswith(h264.START)
         if begins and self._has_picture():
             found += self._end(whole=False)  # the last piece is missing, unless it happened to be as long as the others
         if not begins and not self._pieces:
@@ -325,7 +313,7 @@ class Assembly:
         """Return whether a slice has arrived; parameter sets may arrive in separate datagrams."""
         if not self._pieces:
             return False
-        return any(type_of(unit) in (SLICE, IDR) for unit in units_of(self._head()))
+        return any(h264.unit_type(unit) in _SLICES for unit in h264.units(self._head()))
 
     def _head(self) -> bytes:
         head = b""
@@ -340,12 +328,12 @@ class Assembly:
         self._pieces, self._size, self._gap = [], 0, True
 
     def _end(self, *, whole: bool) -> list[AccessUnit]:
-        head = units_of(self._head())
-        kinds = {type_of(unit) for unit in head}
+        head = h264.units(self._head())
+        kinds = {h264.unit_type(unit) for unit in head}
         gap = self._is_gap(head)
         data = b"".join(self._pieces)
         self._pieces, self._size = [], 0
-        is_key = IDR in kinds and {SPS, PPS} <= kinds
+        is_key = h264.IDR in kinds and {h264.SPS, h264.PPS} <= kinds
         size = (0, 0) if self._sequence is None else (self._sequence.width, self._sequence.height)
         made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole, self._count, *size)
         self._gap = False
@@ -356,17 +344,17 @@ class Assembly:
         """Return whether this image's number does not follow the previous one, and store the number."""
         try:
             for unit in head:
-                if type_of(unit) == SPS:
-                    self._sequence = parse_sequence(unit)
+                if h264.unit_type(unit) == h264.SPS:
+                    self._sequence = h264.parse_sequence(unit)
             if self._sequence is None:
                 return False
-            now = parse_slice(next(unit for unit in head if type_of(unit) in (SLICE, IDR)), self._sequence)
+            now = h264.parse_slice(next(unit for unit in head if h264.unit_type(unit) in _SLICES), self._sequence)
         except DecodeError:
             self._before = None
             return False
         before, self._before = self._before, now
         if now.is_key or before is None:
             return False
-        skipped = missing_between(before, now, self._sequence)
+        skipped = h264.missing_between(before, now, self._sequence)
         self.missing += min(skipped, 1 << self._sequence.frame_number_bits - 1)
         return skipped != 0 or not now.is_first

@@ -97,8 +97,6 @@ class VideoDriver(Driver):
             self._thread.join(_CLOSE_S)
         self._thread = self._live = None
 
-    # A file ----------------------------------------------------------------------------------------------------------
-
     def _run(self, sink: Sink, source: Source) -> None:
         options = self.options
         try:
@@ -108,8 +106,6 @@ class VideoDriver(Driver):
         except Exception as error:  # noqa: BLE001  an unexpected error in a codec must be reported
             sink.event(EventKind.DRIVER_ERROR, f"{self.uri}: {error!r}", Severity.ERROR, where="playing")
             sink.link(LinkState.LOST, f"playback failed: {error!r}")
-
-    # A camera --------------------------------------------------------------------------------------------------------
 
     def _live_settings(self, source: CameraSource) -> LiveCameraSettings:
         options = self.options

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,21 +49,6 @@ class DecodedImage:
     turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
 
 
-class Source(Protocol):
-    """One pass over a file."""
-
-    width: int
-    height: int
-    fps: float
-    damaged: int  #: number of pieces so far that could not be decoded
-    stream: str  #: ``h264`` if images with this codec can be relayed unchanged, otherwise empty
-
-    def images(self) -> Iterator[DecodedImage]:
-        """Yield the images in order until the file ends."""
-
-    def close(self) -> None: ...
-
-
 def is_device(path: Path) -> bool:
     """Return whether the path is that of a device, present or not, rather than a file."""
     if path.is_relative_to("/dev"):
@@ -89,12 +74,12 @@ def open_file(path: Path) -> Source:
 
 
 class ContainerSource:
-    """A file or image sequence that PyAV opens."""
+    """One pass over a file or image sequence that PyAV opens."""
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self.damaged = 0
-        self.stream = ""
+        self.damaged = 0  #: number of pieces so far that could not be decoded
+        self.stream = ""  #: ``h264`` if images with this codec can be relayed unchanged, otherwise empty
         try:
             self._container: InputContainer = av.open(name)
         except (FFmpegError, OSError, ValueError) as error:
@@ -119,7 +104,6 @@ class ContainerSource:
             self.stream = H264
 
     def images(self) -> Iterator[DecodedImage]:
-        """See :meth:`Source.images`."""
         stamp_s = -1.0 / self.fps
         coded: dict[int | None, tuple[int, Unit | None]] = {}  # keyed by stamp, because decoders delay images
         for number, packet in enumerate(self._packets()):
@@ -146,7 +130,6 @@ class ContainerSource:
             self.damaged += 1  # a truncated file, in which everything before the cut is usable
 
     def close(self) -> None:
-        """Close the file."""
         self._container.close()
 
     def _error(self, what: str, error: Exception) -> Exception:
@@ -166,7 +149,7 @@ def _quarter_turns(name: str) -> int:
 
 
 class PaveSource:
-    """A file with the raw bytes from an AR.Drone 2's video port.
+    """One pass over a file with the raw bytes from an AR.Drone 2's video port.
 
     Images before the first key frame (in a truncated stream, or the drone's stale first frame) and between damage and
     the next key frame are dropped because they would be smeared.
@@ -198,13 +181,15 @@ class PaveSource:
                 yield DecodedImage(frame.timestamp_ms / 1000.0, image, unit, frame.number)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def _parser_frames(self) -> Iterator[PaveFrame]:
         while chunk := self._file.read(CHUNK):
             yield from self._parser.feed(chunk)
         self._parser.end()
+
+
+Source = ContainerSource | PaveSource
 
 
 FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
@@ -303,12 +288,7 @@ class CameraPublisher:
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
-                self._camera,
-                pixels,
-                due_ns,
-                width=width,
-                height=height,
-                intrinsics=self._intrinsics(width, height),
+                self._camera, pixels, due_ns, width=width, height=height, intrinsics=self._intrinsics(width, height)
             )
         return not self.stop.is_set()
 

@@ -110,7 +110,6 @@ class V4l2Device:
     """An open device."""
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
-        """Store the arguments. No I/O."""
         if ioctl is None:
             from fcntl import ioctl as kernels  # not available on Windows
 

@@ -17,7 +17,7 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Faults, Ports, with_ardrones
-from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
@@ -126,7 +126,7 @@ def test_a_flight(drone: ArdroneFirmware, pilot: Pilot) -> None:
     take_off(pilot)
     assert 0.7 < drone.host.simulation.truth(0).position_m[2] < 1.1
     pilot.pcmd = (1, 0.0, -0.5, 0.0, 0.0)
-    demo = pilot.until(lambda n: n.options[o.Demo].vx > 500, "it flies forward").get(o.Demo)  # type: ignore[union-attr]
+    demo = pilot.until(lambda n: n.options[o.Demo].vx > 500, "it flies forward").get(o.Demo)
     assert demo is not None
     pilot.pcmd = (1, 0.0, 0.0, 0.0, 1.0)
     before = drone.host.simulation.truth(0).yaw_rad
@@ -143,7 +143,7 @@ def test_the_motors_are_cut_and_the_emergency_is_reset(pilot: Pilot) -> None:
     down = pilot.until(lambda n: n.state & State.EMERGENCY, "the motors are cut")
     assert down.state & State.USER_EMERGENCY
     pilot.ref = LAND
-    pilot.until(lambda n: abs(n.options[o.Demo].altitude) < 60, "it has fallen")  # type: ignore[union-attr]
+    pilot.until(lambda n: abs(n.options[o.Demo].altitude) < 60, "it has fallen")
     pilot.ref = EMERGENCY
     pilot.until(lambda n: not n.state & State.EMERGENCY, "the emergency is over")
     take_off(pilot)

@@ -15,8 +15,8 @@ from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError
 from skyloop.faults import Faults
 from skyloop.transport.testing import wait_until
-from skyloop.vehicles.ardrone.emulator.streams import MOST_BACKLOG, MOST_CLIENTS, StreamPort
-from skyloop.vehicles.emulation.datagrams import Address, DatagramPort, Loop
+from skyloop.vehicles.ardrone.emulator import MOST_BACKLOG, MOST_CLIENTS, StreamPort
+from skyloop.vehicles.emulation.emulator import Address, DatagramPort, Loop
 
 HERE = "127.0.0.1"
 KEY_EVERY = 15

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from skyloop.messages import FlightState
+from skyloop.vehicles.ardrone.emulator import MOST, Listeners
 from skyloop.vehicles.ardrone.emulator.flight import Progress
-from skyloop.vehicles.ardrone.emulator.streams import MOST, Listeners
 from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.emulator.video import DroneClock
-from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, decode, encode
 from skyloop.vehicles.emulation.video import VideoStatus
 from tests.vehicles.ardrone.emulator.rig import RESTING

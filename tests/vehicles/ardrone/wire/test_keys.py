@@ -15,7 +15,7 @@ from skyloop.vehicles.ardrone.wire.configuration import (
     keys_of,
     parse_value,
 )
-from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, VisionDetect
+from skyloop.vehicles.ardrone.wire.navdata import LAYOUTS, Demo, VisionDetect
 
 
 @pytest.mark.parametrize("key", KEYS.values(), ids=lambda key: key.name)

@@ -10,17 +10,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.wire import options
-from skyloop.vehicles.ardrone.wire.navdata import MAX_DATAGRAM, ControlState, State, decode, encode
-from skyloop.vehicles.ardrone.wire.options import (
+from skyloop.vehicles.ardrone.wire.navdata import (
     BY_TAG_AND_SIZE,
     LAYOUTS,
+    MAX_DATAGRAM,
+    ControlState,
     Demo,
     Gps,
+    Magneto,
+    PressureRaw,
+    RawMeasures,
+    State,
     Time,
     VisionDetect,
     Wifi,
     Zimmu3000,
+    decode,
+    encode,
 )
 from tests.support.recordings import content, needs_recordings
 
@@ -57,13 +63,13 @@ def test_the_recorded_datagram() -> None:
     assert demo is not None
     assert (demo.ctrl_state >> 16, demo.battery, demo.altitude) == (ControlState.LANDED, 50, 0)
     assert (demo.theta, demo.phi, demo.psi) == (2974.0, 550.0, 1933.0)
-    raw = navdata.get(options.RawMeasures)
+    raw = navdata.get(RawMeasures)
     assert raw is not None
     assert raw.vbat == 11686
-    pressure = navdata.get(options.PressureRaw)
+    pressure = navdata.get(PressureRaw)
     assert pressure is not None
     assert pressure.pressure == 101586
-    magneto = navdata.get(options.Magneto)
+    magneto = navdata.get(Magneto)
     assert magneto is not None
     assert (magneto.mx, magneto.my, magneto.mz, magneto.calibrated) == (30, -56, 80, 1)
     assert navdata.get(Gps) is None

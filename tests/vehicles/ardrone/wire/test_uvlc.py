@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.ardrone.wire.uvlc import MAX_PACKET, UvlcDecoder, UvlcPicture, is_p264
-from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES, PictureType
+from skyloop.vehicles.ardrone.wire.uvlc import MAX_PACKET, SIZES, PictureType, UvlcDecoder, UvlcPicture, is_p264
 from tests.vehicles.ardrone.wire.uvlc_bits import (
     END,
     GREY,

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.vehicles.ardrone.emulator.video import MAX_DATAGRAM, encode
-from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture
-from skyloop.vehicles.ardrone.wire.uvlc_codes import SIZES
+from skyloop.vehicles.ardrone.wire.uvlc import SIZES, UvlcDecoder, UvlcPicture
 from tests.vehicles.ardrone.wire.uvlc_bits import GREY, header, level, macroblock, packet, picture, run
 from tests.vehicles.ardrone.wire.uvlc_pictures import Picture, noise, scenery
 

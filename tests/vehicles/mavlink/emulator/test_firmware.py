@@ -15,7 +15,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import PATIENCE_S
-from skyloop.vehicles.emulation.datagrams import Loop
+from skyloop.vehicles.emulation.emulator import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.emulator.links import Streams
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.vehicles.mavlink.wire import axes, modes
+from skyloop.vehicles.mavlink.wire import axes, codec
 from skyloop.vehicles.mavlink.wire.codec import (
     Codec,
     Message,
@@ -110,11 +110,11 @@ def test_texts_hold_no_control_characters() -> None:
 
 
 def test_modes_have_names() -> None:
-    assert modes.copter_mode(4) == "GUIDED"
-    assert modes.copter_mode(99) == "MODE_99"
-    assert modes.px4_mode(modes.px4_custom("AUTO.LAND")) == "AUTO.LAND"
-    assert modes.px4_mode(modes.px4_custom("OFFBOARD")) == "OFFBOARD"
-    assert modes.px4_mode(17 << 16) == "MODE_17.0"
+    assert codec.copter_mode(4) == "GUIDED"
+    assert codec.copter_mode(99) == "MODE_99"
+    assert codec.px4_mode(codec.px4_custom("AUTO.LAND")) == "AUTO.LAND"
+    assert codec.px4_mode(codec.px4_custom("OFFBOARD")) == "OFFBOARD"
+    assert codec.px4_mode(17 << 16) == "MODE_17.0"
 
 
 @given(ANGLES, st.floats(-1.5, 1.5), ANGLES)

@@ -15,8 +15,7 @@ import msgspec
 
 import skyloop
 from skyloop.sim.instruments import GpsFix, Readings
-from skyloop.vehicles.sim.firmware.coupling import CoupledFirmware
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import CoupledFirmware, FirmwareEvent, FirmwareEventKind
 
 SOURCE = Path(skyloop.__file__).parents[1]
 STANDINS = Path(__file__).parent / "standins"

@@ -13,10 +13,8 @@ from pathlib import Path
 import pytest
 
 from skyloop.errors import UsageError
-from skyloop.vehicles.sim.firmware import coupling
 from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE, ArduCopter
-from skyloop.vehicles.sim.firmware.coupling import STOPPED, WAIT_S
-from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import STOPPED, WAIT_S, FirmwareEventKind
 from tests.vehicles.sim.firmware.rig import COMMANDS, Rig, flying, program
 
 pytestmark = pytest.mark.process
@@ -35,7 +33,7 @@ def states(tmp_path: Path) -> list[dict[str, object]]:
 
 @pytest.fixture
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is not silence
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.program.WAIT_S", 20.0)  # a busy machine is not silence
 
 
 def test_it_flies_in_step(rig: Rig, patience: None, tmp_path: Path) -> None:

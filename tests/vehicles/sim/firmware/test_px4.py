@@ -15,10 +15,9 @@ import pytest
 
 from skyloop.errors import UsageError
 from skyloop.sim.parameters import InstrumentParameters
-from skyloop.vehicles.sim.firmware import coupling, px4
-from skyloop.vehicles.sim.firmware.coupling import STOPPED
+from skyloop.vehicles.sim.firmware import px4
 from skyloop.vehicles.sim.firmware.ports import bound
-from skyloop.vehicles.sim.firmware.program import FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import STOPPED, FirmwareEventKind
 from skyloop.vehicles.sim.firmware.px4 import STEP_US, STEPS, VARIABLE, Px4
 from tests.vehicles.sim.firmware.rig import COMMANDS, FIX, Rig, flying, program
 
@@ -53,7 +52,7 @@ def messages(tmp_path: Path) -> list[tuple[str, int]]:
 
 
 def test_it_flies_in_step(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is not silence
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.program.WAIT_S", 20.0)  # a busy machine is not silence
     rig.answered()
     answers = [rig.step(gps=FIX if n == 10 else None) for n in range(40 * STEPS)]
     given = [commands for commands in answers if commands is not None]

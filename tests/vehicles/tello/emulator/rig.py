@@ -14,7 +14,7 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.reports import VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
-from skyloop.vehicles.emulation.datagrams import Address
+from skyloop.vehicles.emulation.emulator import Address
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.tello.emulator import LIMITS, TELLO
 from skyloop.vehicles.tello.emulator.logic import TelloLogic

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from skyloop.messages import FlightState, Takeoff
-from skyloop.vehicles.tello.emulator.manoeuvres import OK, RISES_WITHIN_S, SPIN_UP_S, TAKEOFF_ANSWER_S, Rising
+from skyloop.vehicles.tello.emulator.logic import OK, RISES_WITHIN_S, SPIN_UP_S, TAKEOFF_ANSWER_S, Rising
 
 
 def at(time_s: float, state: FlightState = FlightState.LANDED) -> Any:

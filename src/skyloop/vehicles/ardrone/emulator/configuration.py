@@ -69,16 +69,13 @@ class Configuration:
         self._ids = dict.fromkeys(Category, DEFAULT_ID)
 
     def __getitem__(self, name: str) -> Value:
-        """Return the current value of a key."""
         category = self._keys[name].category
         return self._values[category][self._ids[category]][name]
 
     def __contains__(self, name: str) -> bool:
-        """Return whether this version of the drone has the key."""
         return name in self._keys
 
     def number(self, name: str) -> float:
-        """Return the current value of a numeric key."""
         value = self[name]
         assert isinstance(value, int | float)
         return value

@@ -46,7 +46,6 @@ class Progress:
 
     @property
     def makes_sense(self) -> bool:
-        """Whether all numbers are finite."""
         values = (self.roll, self.pitch, self.gaz, self.yaw, self.heading or 0.0)
         return all(math.isfinite(value) for value in values)
 

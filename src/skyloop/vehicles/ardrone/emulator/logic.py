@@ -78,12 +78,10 @@ class VideoSettings:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _CAMERAS[self.channel]
 
     @property
     def inset(self) -> tuple[int, int]:
-        """See :class:`skyloop.vehicles.emulation.video.VideoSettings`."""
         return _INSETS.get(self.channel, (0, 0))
 
 
@@ -117,17 +115,17 @@ class ArdroneLogic:
         self.malformed = 0  #: number of invalid lines, unknown commands and wrong arguments
         self.stale = 0  #: number of commands whose sequence number was not new
         self._handlers: dict[str, Callable[..., None]] = {
-            "REF": self._ref,
+            "REF": lambda bits: self.flight.ref(int(bits)),
             "PCMD": self._pcmd,
             "PCMD_MAG": partial(self._pcmd_mag, version),
             "FTRIM": lambda *_: self.flight.flat_trim(),
-            "CALIB": self._calib,
+            "CALIB": lambda device: self.flight.calibrate(device, clock()),
             "CONFIG": self._config,
             "CONFIG_IDS": self._config_ids,
             "COMWDG": self._comwdg,
             "CTRL": self._ctrl,
             "LED": self._led,
-            "ANIM": self._anim,
+            "ANIM": lambda number, duration_ms: self.flight.animate(number, duration_ms, clock()),
             "ZAP": lambda channel: self._set("video:video_channel", str(channel)),
             "CAD": lambda kind, _: self._set("detect:detect_type", str(kind)),
         }
@@ -224,9 +222,6 @@ class ArdroneLogic:
         except (TypeError, ValueError, OverflowError):  # too few or too many arguments, or text instead of a number
             self.malformed += 1
 
-    def _ref(self, bits: int) -> None:
-        self.flight.ref(int(bits))
-
     def _pcmd(self, flags: int, *values: int) -> None:
         roll, pitch, gaz, yaw = map(to_float, values)
         self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw), self._clock())
@@ -235,9 +230,6 @@ class ArdroneLogic:
         roll, pitch, gaz, yaw, heading, _accuracy = map(to_float, values)
         if version > 1:
             self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw, heading), self._clock())
-
-    def _calib(self, device: int) -> None:
-        self.flight.calibrate(device, self._clock())
 
     def _comwdg(self, *_: int | str) -> None:
         self._watchdog = False
@@ -256,9 +248,6 @@ class ArdroneLogic:
 
     def _led(self, number: int, frequency: int, duration_s: int) -> None:
         self.leds = LedAnimation(number, to_float(frequency), duration_s)
-
-    def _anim(self, number: int, duration_ms: int) -> None:
-        self.flight.animate(number, duration_ms, self._clock())
 
     def _config_ids(self, session: str, user: str, application: str) -> None:
         self._ids = (str(session).lower(), str(user).lower(), str(application).lower())

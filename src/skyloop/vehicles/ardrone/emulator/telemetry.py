@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from skyloop.messages import FlightState
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, Progress
-from skyloop.vehicles.ardrone.wire import options as o
+from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.configuration import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
 from skyloop.vehicles.emulation.video import NOTHING_SENT, VideoStatus
@@ -104,7 +104,7 @@ def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
     return [tag for tag in range(last + 1) if mask >> tag & 1]
 
 
-def _demo(s: Snapshot) -> o.Demo:
+def _demo(s: Snapshot) -> o.Option:
     vx, vy, _ = s.velocity_mm_s  # real drones always report vz as 0
     state = ControlState.LOOPING if s.flipping and s.state.airborne else _CONTROL_STATES[s.state]
     return o.Demo(
@@ -131,34 +131,29 @@ def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
     return math.degrees(x), -math.degrees(y), -math.degrees(z)
 
 
-def _raw(s: Snapshot) -> o.RawMeasures:
+def _raw(s: Snapshot) -> o.Option:
     """Return the raw measurements. The converters' scales are estimates; programs read the battery voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
         gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),
         gyros_110=tuple(_within(rate * 64, -32768, 32767) for rate in _rates_deg_s(s)[:2]),
-        vbat=_millivolts(s),
+        vbat=_within(s.believed.battery_v * 1000, 0, 0xFFFFFFFF),
         us_distance_echo=_within(s.altitude_mm / 10, 0, 65535),
     )
 
 
-def _physical(s: Snapshot) -> o.PhysMeasures:
+def _physical(s: Snapshot) -> o.Option:
     return o.PhysMeasures(acc_temp=45.0, gyro_temp=0, accs=_accelerations_mg(s), gyros=_rates_deg_s(s), alim_3v3=3300)
 
 
-def _euler_angles(s: Snapshot) -> o.EulerAngles:
+def _euler_angles(s: Snapshot) -> o.Option:
     """Return the attitude computed from the accelerometers alone, which is correct only without acceleration."""
     x, y, z = s.believed.acceleration_m_s2
     theta = math.degrees(math.atan2(x, math.hypot(y, z)))
     return o.EulerAngles(theta * 1000, -math.degrees(math.atan2(y, abs(z))) * 1000)
 
 
-def _references(s: Snapshot) -> o.References:
-    p = s.progress
-    return o.References(ui_theta=p.pitch, ui_phi=p.roll, ui_psi=p.yaw)
-
-
-def _rc_references(s: Snapshot) -> o.RcReferences:
+def _rc_references(s: Snapshot) -> o.Option:
     pitch, roll, yaw, gaz = (
         _within(value * 1000, -32768, 32767)
         for value in (s.progress.pitch, s.progress.roll, s.progress.yaw, s.progress.gaz)
@@ -166,13 +161,13 @@ def _rc_references(s: Snapshot) -> o.RcReferences:
     return o.RcReferences(pitch, roll, yaw, gaz, s.progress.flags & 1)
 
 
-def _pwm(s: Snapshot) -> o.Pwm:
+def _pwm(s: Snapshot) -> o.Option:
     """Return motor values proportional to thrust, the same for all motors."""
     motor = _within(255 * s.thrust / s.most_thrust, 0, 255)
     return o.Pwm(motors=(motor,) * 4, saturations=(255 if motor else 0,) * 4, vz_ref=s.progress.gaz)
 
 
-def _altitude(s: Snapshot) -> o.Altitude:
+def _altitude(s: Snapshot) -> o.Option:
     mm = s.altitude_mm
     return o.Altitude(
         vision=round(mm),
@@ -184,7 +179,7 @@ def _altitude(s: Snapshot) -> o.Altitude:
     )
 
 
-def _vision(s: Snapshot) -> o.Vision:
+def _vision(s: Snapshot) -> o.Option:
     return o.Vision(
         theta_capture=math.radians(s.theta_mdeg / 1000),
         phi_capture=math.radians(s.phi_mdeg / 1000),
@@ -195,7 +190,7 @@ def _vision(s: Snapshot) -> o.Vision:
     )
 
 
-def _video_stream(s: Snapshot) -> o.VideoStream:
+def _video_stream(s: Snapshot) -> o.Option:
     return o.VideoStream(
         frame_size=s.video.bytes_last & 0xFFFFFFFF,
         frame_number=s.video.pictures & 0xFFFFFFFF,
@@ -204,12 +199,12 @@ def _video_stream(s: Snapshot) -> o.VideoStream:
     )
 
 
-def _pressure_raw(s: Snapshot) -> o.PressureRaw:
+def _pressure_raw(s: Snapshot) -> o.Option:
     pressure = STANDARD_PRESSURE_PA - PRESSURE_PA_PER_M * s.believed.altitude_m
     return o.PressureRaw(temperature=TEMPERATURE_DECI_C, pressure=round(pressure))
 
 
-def _magneto(s: Snapshot) -> o.Magneto:
+def _magneto(s: Snapshot) -> o.Option:
     heading = math.radians(s.heading_deg)
     level, down = FIELD_MG
     field = (level * math.cos(heading), -level * math.sin(heading), down)
@@ -226,49 +221,21 @@ def _magneto(s: Snapshot) -> o.Magneto:
     )
 
 
-def _kalman_pressure(s: Snapshot) -> o.KalmanPressure:
-    return o.KalmanPressure(est_z=s.altitude_mm, est_zdot=-s.velocity_mm_s[2])
-
-
-def _zero(kind: Callable[[], Any]) -> Callable[[Snapshot], Any]:
+def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
     option = kind()
     return lambda _: option
 
 
-_MAKERS: Final[dict[int, Callable[[Snapshot], Any]]] = {
-    0: _demo,
-    1: lambda s: o.Time(s.time),
-    2: _raw,
-    3: _physical,
-    4: _zero(o.GyrosOffsets),
-    5: _euler_angles,
-    6: _references,
-    7: lambda s: o.Trims(0.0, -s.trim_rad[1], s.trim_rad[0]),
-    8: _rc_references,
-    9: _pwm,
-    10: _altitude,
-    11: _zero(o.VisionRaw),
-    12: _zero(o.VisionOpticalFlow),
-    13: _vision,
-    14: _zero(o.VisionPerf),
-    15: _zero(o.TrackersSend),
-    16: _zero(o.VisionDetect),
-    17: _zero(o.Watchdog),
-    18: _zero(o.AdcDataFrame),
-    19: _video_stream,
-    20: _zero(o.Games),
-    21: _pressure_raw,
-    22: _magneto,
-    23: _zero(o.WindSpeed),
-    24: _kalman_pressure,
-    25: _zero(o.HdVideo),
-    26: lambda s: o.Wifi(s.link_quality),
-    27: _zero(o.Gps),
+#: By tag; options without any values to report are zero, and 27 is ``Gps``.
+_MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
+    **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
+    **{0: _demo, 1: lambda s: o.Time(s.time), 2: _raw, 3: _physical, 5: _euler_angles},
+    **{6: lambda s: o.References(ui_theta=s.progress.pitch, ui_phi=s.progress.roll, ui_psi=s.progress.yaw)},
+    **{7: lambda s: o.Trims(0.0, -s.trim_rad[1], s.trim_rad[0]), 8: _rc_references, 9: _pwm},
+    **{10: _altitude, 13: _vision, 19: _video_stream, 21: _pressure_raw, 22: _magneto},
+    **{24: lambda s: o.KalmanPressure(est_z=s.altitude_mm, est_zdot=-s.velocity_mm_s[2])},
+    **{26: lambda s: o.Wifi(s.link_quality)},
 }
-
-
-def _millivolts(s: Snapshot) -> int:
-    return _within(s.believed.battery_v * 1000, 0, 0xFFFFFFFF)
 
 
 def _within(value: float, low: int, high: int) -> int:

@@ -19,31 +19,9 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
+from skyloop.vehicles.ardrone.wire import uvlc
 from skyloop.vehicles.ardrone.wire.configuration import VideoCodec
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, build_header
-from skyloop.vehicles.ardrone.wire.uvlc_codes import (
-    BLOCKS,
-    COARSEST_QUANT,
-    COEFFICIENTS,
-    DC_BITS,
-    END_OF_PICTURE,
-    FINEST_QUANT,
-    FORMAT_BITS,
-    INVERSE_TRANSFORM,
-    MACROBLOCK,
-    NUMBER_BITS,
-    QUANT_BITS,
-    RESOLUTION_BITS,
-    SIDE,
-    SIZES,
-    START_CODE_BITS,
-    STEPS,
-    TABLE_QUALITY,
-    TABLE_QUANT,
-    TYPE_BITS,
-    UVLC_START,
-    PictureType,
-)
 from skyloop.vehicles.emulation.video import Encoder, Format, Piece
 
 _NS_PER_US: Final = 1000
@@ -160,15 +138,14 @@ class UvlcPacker:
         self._number = 0
 
     def pack(self, picture: NDArray[np.uint8], _settings: VideoSettings, _captured_ns: int) -> Piece | None:
-        """Encode an image."""
         self._number += 1
         return Piece(encode(picture, self._number & 0xFFFFFFFF), starts=True)
 
 
 MAX_DATAGRAM: Final = 65_507  #: maximum payload of a UDP datagram over IPv4 in bytes
-_COARSER: Final = (4, 8, 16, COARSEST_QUANT)  # quantisers to try in turn if an image needs too many bytes
+_COARSER: Final = (4, 8, 16, uvlc.COARSEST_QUANT)  # quantisers to try in turn if an image needs too many bytes
 _END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code reserved for the end of a block
-_CODES: Final = {size: code for code, size in SIZES.items()}
+_CODES: Final = {size: code for code, size in uvlc.SIZES.items()}
 
 # Conversion of BGR to YCbCr: BT.601, full range.
 _LUMA: Final = np.array([0.114, 0.587, 0.299], np.float32)
@@ -179,26 +156,18 @@ Ints = NDArray[np.int64]
 
 
 def encode(
-    picture: NDArray[np.uint8], number: int, *, quant: int = TABLE_QUANT, max_bytes: int = MAX_DATAGRAM
+    picture: NDArray[np.uint8], number: int, *, quant: int = uvlc.TABLE_QUANT, max_bytes: int = MAX_DATAGRAM
 ) -> bytes:
-    """Encode an image as one datagram.
+    """Encode an image (BGR, uint8, shape (height, width, 3), with one of the format's sizes) as one datagram.
 
-    Macroblocks that would be partly outside the image are omitted, as the format requires.
-
-    Args:
-        picture: BGR, uint8, shape (height, width, 3), with one of the format's sizes.
-        number: The picture number.
-        quant: 1 (finest) to 30, or 31, which is like 2 and is the one that real drones use.
-        max_bytes: Maximum size; an image that would need more is quantised more coarsely.
-
-    Raises:
-        UsageError: The size or type is wrong, the number or quantiser is out of range, or the image does not fit even
-            with the coarsest quantiser.
+    Macroblocks that would be partly outside the image are omitted, as the format requires. ``quant`` is 1 (finest) to
+    30, or 31, which is like 2 and is the one that real drones use; an image that would need more than ``max_bytes`` is
+    quantised more coarsely. Raises :class:`UsageError` if an argument is out of range, or the image never fits.
     """
     _check(picture, number, quant)
     height, width = picture.shape[:2]
     coefficients = _coefficients(picture)
-    fineness = TABLE_QUALITY if quant == TABLE_QUANT else quant
+    fineness = uvlc.TABLE_QUALITY if quant == uvlc.TABLE_QUANT else quant
     for q in (quant, *(coarser for coarser in _COARSER if coarser > fineness)):
         packet = _pack(_quantised(coefficients, q), _CODES[width, height], q, number)
         if len(packet) <= max_bytes:
@@ -212,53 +181,60 @@ def _check(picture: NDArray[np.uint8], number: int, quant: int) -> None:
     if picture.shape[1::-1] not in _CODES:
         sizes = ", ".join(f"{w}x{h}" for w, h in sorted(_CODES))
         raise UsageError(f"UVLC has no pictures of {picture.shape[1]}x{picture.shape[0]}; it has {sizes}")
-    if not 0 <= number < 1 << NUMBER_BITS:
-        raise UsageError(f"a picture's number has {NUMBER_BITS} bits; {number} doesn't fit")
-    if not FINEST_QUANT <= quant <= TABLE_QUANT:
-        raise UsageError(f"a quantiser is {FINEST_QUANT} to {TABLE_QUANT}, not {quant}")
+    if not 0 <= number < 1 << uvlc.NUMBER_BITS:
+        raise UsageError(f"a picture's number has {uvlc.NUMBER_BITS} bits; {number} doesn't fit")
+    if not uvlc.FINEST_QUANT <= quant <= uvlc.TABLE_QUANT:
+        raise UsageError(f"a quantiser is {uvlc.FINEST_QUANT} to {uvlc.TABLE_QUANT}, not {quant}")
 
 
 def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return an image's transformed macroblocks in stream order. Shape (groups, columns, 6, 64)."""
-    groups, columns = picture.shape[0] // MACROBLOCK, picture.shape[1] // MACROBLOCK
-    pixels = picture[: groups * MACROBLOCK, : columns * MACROBLOCK].astype(np.float32)
+    groups, columns = picture.shape[0] // uvlc.MACROBLOCK, picture.shape[1] // uvlc.MACROBLOCK
+    pixels = picture[: groups * uvlc.MACROBLOCK, : columns * uvlc.MACROBLOCK].astype(np.float32)
     luma = pixels @ _LUMA
-    quads = pixels.reshape(groups * SIDE, 2, columns * SIDE, 2, 3)
+    quads = pixels.reshape(groups * uvlc.SIDE, 2, columns * uvlc.SIDE, 2, 3)
     blue, green, red = np.moveaxis(quads.mean(axis=(1, 3)), -1, 0)
     small = _LUMA[0] * blue + _LUMA[1] * green + _LUMA[2] * red
-    samples = np.empty((groups, columns, BLOCKS, SIDE, SIDE), np.float32)
+    samples = np.empty((groups, columns, uvlc.BLOCKS, uvlc.SIDE, uvlc.SIDE), np.float32)
     samples[:, :, :4] = (
-        luma.reshape(groups, 2, SIDE, columns, 2, SIDE)
+        luma.reshape(groups, 2, uvlc.SIDE, columns, 2, uvlc.SIDE)
         .transpose(0, 3, 1, 4, 2, 5)
-        .reshape(groups, columns, 4, SIDE, SIDE)
+        .reshape(groups, columns, 4, uvlc.SIDE, uvlc.SIDE)
     )
     for k, chroma in enumerate(((blue - small) * _CB, (red - small) * _CR), start=4):
-        samples[:, :, k] = (chroma + 128).reshape(groups, SIDE, columns, SIDE).transpose(0, 2, 1, 3)
-    flat = samples.reshape(-1, COEFFICIENTS) @ INVERSE_TRANSFORM.T
-    return flat.reshape(groups, columns, BLOCKS, COEFFICIENTS)
+        samples[:, :, k] = (chroma + 128).reshape(groups, uvlc.SIDE, columns, uvlc.SIDE).transpose(0, 2, 1, 3)
+    flat = samples.reshape(-1, uvlc.COEFFICIENTS) @ uvlc.INVERSE_TRANSFORM.T
+    return flat.reshape(groups, columns, uvlc.BLOCKS, uvlc.COEFFICIENTS)
 
 
 def _quantised(coefficients: NDArray[np.float32], quant: int) -> Ints:
-    levels: Ints = (coefficients / STEPS[quant].astype(np.float32)).astype(np.int64)
+    levels: Ints = (coefficients / uvlc.STEPS[quant].astype(np.float32)).astype(np.int64)
     # The mean is rounded because truncation would darken the picture. As in the Parrot SDK, it is never 0.
-    mean = np.rint(coefficients[..., 0] / STEPS[quant][0])
-    levels[..., 0] = np.clip(mean, 1, (1 << DC_BITS) - 1)
+    mean = np.rint(coefficients[..., 0] / uvlc.STEPS[quant][0])
+    levels[..., 0] = np.clip(mean, 1, (1 << uvlc.DC_BITS) - 1)
     return levels
 
 
 def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> bytes:
     """Return the packet for quantised macroblocks, shape (groups, columns, 6, 64)."""
-    start = [UVLC_START, *size_code, PictureType.INTRA, quant, number]
-    widths = [START_CODE_BITS, FORMAT_BITS, RESOLUTION_BITS, TYPE_BITS, QUANT_BITS, NUMBER_BITS]
+    start = [uvlc.UVLC_START, *size_code, uvlc.PictureType.INTRA, quant, number]
+    widths = [
+        uvlc.START_CODE_BITS,
+        uvlc.FORMAT_BITS,
+        uvlc.RESOLUTION_BITS,
+        uvlc.TYPE_BITS,
+        uvlc.QUANT_BITS,
+        uvlc.NUMBER_BITS,
+    ]
     bits = [_bits(np.array(start), np.array(widths))]
     for group, macroblocks in enumerate(levels):
         if group:
             bits += [
                 _filling(bits, 8),
-                _bits(np.array([UVLC_START + group, quant]), np.array([START_CODE_BITS, QUANT_BITS])),
+                _bits(np.array([uvlc.UVLC_START + group, quant]), np.array([uvlc.START_CODE_BITS, uvlc.QUANT_BITS])),
             ]
         bits.append(_bits(*_group_codes(macroblocks)))
-    bits += [_filling(bits, 8), _bits(np.array([END_OF_PICTURE]), np.array([START_CODE_BITS]))]
+    bits += [_filling(bits, 8), _bits(np.array([uvlc.END_OF_PICTURE]), np.array([uvlc.START_CODE_BITS]))]
     bits.append(_filling(bits, 32))
     return np.packbits(np.concatenate(bits)).view(">u4").astype("<u4").tobytes()
 
@@ -270,12 +246,12 @@ def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
 
 def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
     """Return the consecutive codes for a group's macroblocks (columns, 6, 64), and the width of each in bits."""
-    blocks = levels.reshape(-1, COEFFICIENTS)
+    blocks = levels.reshape(-1, uvlc.COEFFICIENTS)
     values, widths, block_of_pair = _pair_codes(blocks)
     pairs = np.bincount(block_of_pair, minlength=len(blocks))
-    described = 0x80 | ((pairs > 0).reshape(-1, BLOCKS) << np.arange(BLOCKS)).sum(axis=1)
+    described = 0x80 | ((pairs > 0).reshape(-1, uvlc.BLOCKS) << np.arange(uvlc.BLOCKS)).sum(axis=1)
     # A block's mean is placed before its pairs, and in the first block after the macroblock's description.
-    is_first = np.arange(len(blocks)) % BLOCKS == 0
+    is_first = np.arange(len(blocks)) % uvlc.BLOCKS == 0
     ends = np.cumsum(1 + is_first + pairs)
     means = ends - pairs - 1
     descriptions = means[is_first] - 1
@@ -283,7 +259,7 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
     is_pair[means] = is_pair[descriptions] = False
     all_values, all_widths = np.empty((2, ends[-1]), np.int64)
     all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # after the 0 bit for "coded"
-    all_values[means], all_widths[means] = blocks[:, 0], DC_BITS
+    all_values[means], all_widths[means] = blocks[:, 0], uvlc.DC_BITS
     all_values[is_pair], all_widths[is_pair] = values, widths
     return all_values, all_widths
 

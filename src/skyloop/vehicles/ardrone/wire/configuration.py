@@ -155,22 +155,33 @@ _GENERAL: Final = (
     Key("general:vbat_min", 9000, unit="mV", low=0, high=20000, text="battery at which the drone lands by itself"),
     Key("general:localtime", 0, unit="s", text="the host's time, for the names of recordings", versions=(2,)),
 )
+
+
+def _calibration(name: str, value: Value, sensor: str, versions: tuple[int, ...] = (1, 2)) -> Key:
+    return Key(f"control:{name}", value, read_only=True, text=f"calibration of the {sensor}", versions=versions)
+
+
+def _tilt(name: str, usual_deg: float, high: float, text: str) -> Key:
+    return Key(f"control:{name}", math.radians(usual_deg), Category.USER, "rad", 0.0, high, text=text)
+
+
+def _climb(name: str, usual_mm_s: float, text: str) -> Key:
+    return Key(f"control:{name}", usual_mm_s, Category.USER, "mm/s", 200, 2000, text=text)
+
+
+def _yaw_rate(name: str, usual_deg_s: float, text: str) -> Key:
+    return Key(f"control:{name}", math.radians(usual_deg_s), Category.USER, "rad/s", 0.7, 6.11, text=text)
+
+
 _CONTROL: Final = (
-    Key("control:accs_offset", (0.0, 0.0, 0.0), read_only=True, text="calibration of the accelerometers"),
-    Key(
-        "control:accs_gains",
-        (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
-        read_only=True,
-        text="calibration of the accelerometers",
-    ),
-    Key("control:gyros_offset", (0.0, 0.0, 0.0), read_only=True, text="calibration of the gyros"),
-    Key("control:gyros_gains", (1.0, 1.0, 1.0), read_only=True, text="calibration of the gyros"),
-    Key("control:gyros110_offset", (0.0, 0.0), read_only=True, text="calibration of the gyros"),
-    Key("control:gyros110_gains", (1.0, 1.0), read_only=True, text="calibration of the gyros"),
-    Key(
-        "control:magneto_offset", (0.0, 0.0, 0.0), read_only=True, text="calibration of the magnetometer", versions=(2,)
-    ),
-    Key("control:magneto_radius", 0.0, read_only=True, text="calibration of the magnetometer", versions=(2,)),
+    _calibration("accs_offset", (0.0, 0.0, 0.0), "accelerometers"),
+    _calibration("accs_gains", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), "accelerometers"),
+    _calibration("gyros_offset", (0.0, 0.0, 0.0), "gyros"),
+    _calibration("gyros_gains", (1.0, 1.0, 1.0), "gyros"),
+    _calibration("gyros110_offset", (0.0, 0.0), "gyros"),
+    _calibration("gyros110_gains", (1.0, 1.0), "gyros"),
+    _calibration("magneto_offset", (0.0, 0.0, 0.0), "magnetometer", (2,)),
+    _calibration("magneto_radius", 0.0, "magnetometer", (2,)),
     Key("control:gyro_offset_thr_x", 4.0, read_only=True, text="threshold of the gyro's offset"),
     Key("control:gyro_offset_thr_y", 4.0, read_only=True, text="threshold of the gyro's offset"),
     Key("control:gyro_offset_thr_z", 0.5, read_only=True, text="threshold of the gyro's offset"),
@@ -184,61 +195,17 @@ _CONTROL: Final = (
     Key("control:autonomous_flight", False, text="reserved"),
     Key("control:flight_anim", "0,0", text="flight animation: number, duration [ms]"),
     Key("control:control_level", 0, Category.APPLICATION, low=0, high=3, text="bit 1: combined yaw"),
-    Key(
-        "control:euler_angle_max", math.radians(12), Category.USER, unit="rad", low=0.0, high=0.52, text="greatest tilt"
-    ),
-    Key(
-        "control:control_iphone_tilt",
-        math.radians(20),
-        Category.USER,
-        unit="rad",
-        low=0.0,
-        high=1.0,
-        text="of the phone",
-    ),
-    Key("control:control_vz_max", 700.0, Category.USER, unit="mm/s", low=200, high=2000, text="greatest climb"),
-    Key(
-        "control:control_yaw",
-        math.radians(100),
-        Category.USER,
-        unit="rad/s",
-        low=0.7,
-        high=6.11,
-        text="greatest yaw rate",
-    ),
+    _tilt("euler_angle_max", 12, 0.52, "greatest tilt"),
+    _tilt("control_iphone_tilt", 20, 1.0, "of the phone"),
+    _climb("control_vz_max", 700.0, "greatest climb"),
+    _yaw_rate("control_yaw", 100, "greatest yaw rate"),
     Key("control:manual_trim", False, Category.USER, text="trim by hand"),
-    Key(
-        "control:indoor_euler_angle_max",
-        math.radians(12),
-        Category.USER,
-        unit="rad",
-        low=0.0,
-        high=0.52,
-        text="indoors",
-    ),
-    Key("control:indoor_control_vz_max", 700.0, Category.USER, unit="mm/s", low=200, high=2000, text="indoors"),
-    Key(
-        "control:indoor_control_yaw", math.radians(100), Category.USER, unit="rad/s", low=0.7, high=6.11, text="indoors"
-    ),
-    Key(
-        "control:outdoor_euler_angle_max",
-        math.radians(20),
-        Category.USER,
-        unit="rad",
-        low=0.0,
-        high=0.52,
-        text="outdoors",
-    ),
-    Key("control:outdoor_control_vz_max", 1000.0, Category.USER, unit="mm/s", low=200, high=2000, text="outdoors"),
-    Key(
-        "control:outdoor_control_yaw",
-        math.radians(200),
-        Category.USER,
-        unit="rad/s",
-        low=0.7,
-        high=6.11,
-        text="outdoors",
-    ),
+    _tilt("indoor_euler_angle_max", 12, 0.52, "indoors"),
+    _climb("indoor_control_vz_max", 700.0, "indoors"),
+    _yaw_rate("indoor_control_yaw", 100, "indoors"),
+    _tilt("outdoor_euler_angle_max", 20, 0.52, "outdoors"),
+    _climb("outdoor_control_vz_max", 1000.0, "outdoors"),
+    _yaw_rate("outdoor_control_yaw", 200, "outdoors"),
     Key("control:flying_mode", 0, Category.SESSION, choices=(0, 1, 2, 3), text="0 free, 1 over a roundel, 2 oriented"),
     Key("control:hovering_range", 1000, Category.SESSION, unit="mm", low=0, high=20000, text="of hover over a roundel"),
     Key("control:shield_enable", False, text="the indoor hull is on", versions=(1,)),
@@ -309,50 +276,19 @@ def keys_of(version: int) -> dict[str, Key]:
 
 
 LED_ANIMATIONS: Final = (
-    "blink_green_red",
-    "blink_green",
-    "blink_red",
-    "blink_orange",
-    "snake_green_red",
-    "fire",
-    "standard",
-    "red",
-    "green",
-    "red_snake",
-    "blank",
-    "right_missile",
-    "left_missile",
-    "double_missile",
-    "front_left_green_others_red",
-    "front_right_green_others_red",
-    "rear_right_green_others_red",
-    "rear_left_green_others_red",
-    "left_green_right_red",
-    "left_red_right_green",
-    "blink_standard",
+    *("blink_green_red", "blink_green", "blink_red", "blink_orange", "snake_green_red", "fire", "standard", "red"),
+    *("green", "red_snake", "blank", "right_missile", "left_missile", "double_missile", "front_left_green_others_red"),
+    *("front_right_green_others_red", "rear_right_green_others_red", "rear_left_green_others_red"),
+    *("left_green_right_red", "left_red_right_green", "blink_standard"),
 )
 #: Name and duration [ms] of each flight animation.
 FLIGHT_ANIMATIONS: Final = (
-    ("phi_m30_deg", 1000),
-    ("phi_30_deg", 1000),
-    ("theta_m30_deg", 1000),
-    ("theta_30_deg", 1000),
-    ("theta_20deg_yaw_200deg", 1000),
-    ("theta_20deg_yaw_m200deg", 1000),
-    ("turnaround", 5000),
-    ("turnaround_godown", 5000),
-    ("yaw_shake", 2000),
-    ("yaw_dance", 5000),
-    ("phi_dance", 5000),
-    ("theta_dance", 5000),
-    ("vz_dance", 5000),
-    ("wave", 5000),
-    ("phi_theta_mixed", 5000),
-    ("double_phi_theta_mixed", 5000),
-    ("flip_ahead", 15),
-    ("flip_behind", 15),
-    ("flip_left", 15),
-    ("flip_right", 15),
+    *(("phi_m30_deg", 1000), ("phi_30_deg", 1000), ("theta_m30_deg", 1000), ("theta_30_deg", 1000)),
+    *(("theta_20deg_yaw_200deg", 1000), ("theta_20deg_yaw_m200deg", 1000)),
+    *(("turnaround", 5000), ("turnaround_godown", 5000), ("yaw_shake", 2000), ("yaw_dance", 5000)),
+    *(("phi_dance", 5000), ("theta_dance", 5000), ("vz_dance", 5000), ("wave", 5000)),
+    *(("phi_theta_mixed", 5000), ("double_phi_theta_mixed", 5000)),
+    *(("flip_ahead", 15), ("flip_behind", 15), ("flip_left", 15), ("flip_right", 15)),
 )
 NO_ANIMATION: Final = "none"
 FIRST_FLIP: Final = 16

@@ -8,7 +8,7 @@ two captures from real drones. Headers have 64 bytes in early firmware and 68 in
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
@@ -70,13 +70,7 @@ class PaveFrame:
 class _Header:
     size: int
     payload_size: int
-    codec: int
-    type: int
-    number: int
-    timestamp_ms: int
-    width: int
-    height: int
-    stream_id: int
+    frame: PaveFrame  #: still without its payload
 
 
 def build_header(
@@ -204,17 +198,7 @@ class PaveParser:
         del self._buffer[:end]
         damaged, self._damaged, self._header = self._damaged, False, None
         self.frames += 1
-        return PaveFrame(
-            codec=header.codec,
-            type=header.type,
-            number=header.number,
-            timestamp_ms=header.timestamp_ms,
-            width=header.width,
-            height=header.height,
-            stream_id=header.stream_id,
-            payload=payload,
-            after_damage=damaged,
-        )
+        return replace(header.frame, payload=payload, after_damage=damaged)
 
     def _skip(self, count: int) -> None:
         if count:
@@ -237,4 +221,5 @@ def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None
         return None
     if control & _ADVERTISEMENT:
         payload_size = 0  # an advertisement announces a size but has no payload
-    return _Header(size, payload_size, codec, frame_type, number, timestamp_ms, width, height, stream_id)
+    frame = PaveFrame(codec, frame_type, number, timestamp_ms, width, height, stream_id, b"", after_damage=False)
+    return _Header(size, payload_size, frame)

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,9 +27,7 @@ from skyloop.errors import MissingExtraError, UsageError
 from skyloop.faults import Faults
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.reports import Occurrence, OccurrenceKind
-from skyloop.vehicles.emulation.datagrams import Loop
-from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
@@ -78,7 +75,7 @@ class RunningFirmware(RunningEmulator):
             if settings.video is not None:
                 stream = TransportStream(*settings.video)
                 self._open.append(stream)
-                self._video = encoding(stream)
+                self._video = VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)
                 self._video.start()
             host.attach(drone, self, self, [CAMERA] if self._video is not None else [])
         except BaseException:
@@ -91,13 +88,8 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.autopilot.tick(report)
 
-    # Called by the host, on its threads ------------------------------------------------------------------------
-
-    def happened(self, occurrence: Occurrence) -> None:
-        """Tell the autopilot about a crash, which has stopped the motors."""
-        super().happened(occurrence)
-        if occurrence.kind is OccurrenceKind.EMERGENCY:
-            self._loop.post(partial(self.autopilot.crashed, occurrence.text))
+    def _crashed(self, text: str) -> None:
+        self.autopilot.crashed(text)
 
 
 BOOT_S: Final = 2.0
@@ -199,15 +191,7 @@ _SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
 
 
 class TransportStream:
-    """Encodes and sends each image as it arrives. Not thread-safe.
-
-    Args:
-        host: Host to send to.
-        port: UDP port.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
+    """Encodes and sends each image as it arrives. Not thread-safe. Raises MissingExtraError without PyAV."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -239,10 +223,4 @@ class TransportStream:
             self._container.mux(packet)
 
     def close(self) -> None:
-        """Close the stream."""
         self._container.close()
-
-
-def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
-    """Return the thread that encodes the newest image, not started yet."""
-    return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)

@@ -9,16 +9,7 @@ from typing import ClassVar, Final
 from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import (
-    ACCEPTED,
-    CRITICAL,
-    DENIED,
-    FAILED,
-    INFO,
-    Arguments,
-    Autopilot,
-    whole,
-)
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -33,22 +24,11 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     global_target_of,
     target_of,
 )
-from skyloop.vehicles.mavlink.emulator.services import (
-    MISSION_ACCEPTED,
-    MISSION_ERROR,
-    MISSION_INVALID_X,
-    MISSION_INVALID_Y,
-    MISSION_INVALID_Z,
-    MISSION_UNSUPPORTED,
-    Mission,
-    ParameterTable,
-    mission_ack,
-)
+from skyloop.vehicles.mavlink.emulator.services import Mission, MissionResult, ParameterTable, mission_ack
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, Message
+from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
-from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
 STICK_TIMEOUT_S: Final = 3.0  #: a remote control over MAVLink counts as lost after this much silence
@@ -63,13 +43,6 @@ _OVERRIDDEN: Final = 8  #: number of channels that an override can set
 _IGNORED: Final = 0xFFFF  #: value for a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
-_WORDS: Final = {
-    "armed": "Arming motors",
-    "disarmed": "Disarming motors",
-    "auto_disarm": "Disarming motors",
-    "landed": "Disarming motors",
-    "forced": "Disarming motors",
-}
 
 
 class ArduCopter(Autopilot):
@@ -83,9 +56,13 @@ class ArduCopter(Autopilot):
     ABOVE_SEA = frozenset({0, 5})
     ABOVE_HOME = frozenset({3, 6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_SET_HOME: 0}
-    NOTHING_TO_TELL = FAILED
+    NOTHING_TO_TELL = Result.FAILED
     BYTEWISE = False
     DISARM_S = 10.2
+    WORDS: ClassVar[dict[str, str]] = {
+        "armed": "Arming motors",
+        **dict.fromkeys(("disarmed", "auto_disarm", "landed"), "Disarming motors"),
+    }
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
@@ -110,14 +87,10 @@ class ArduCopter(Autopilot):
 
     @property
     def custom_mode(self) -> int:
-        """The mode's number."""
         return COPTER_NUMBERS[self.mode]
 
     def _counts(self, heartbeat: Message) -> bool:
         return bool(heartbeat.get_srcSystem() == round(self.parameters["MAV_GCS_SYSID"]))
-
-    def _words(self, occasion: str) -> str:
-        return _WORDS[occasion]
 
     # Modes -----------------------------------------------------------------------------------------------------
 
@@ -222,18 +195,18 @@ class ArduCopter(Autopilot):
         mode = COPTER_MODES.get(number)
         if mode is None:
             self.send_text(f"No such mode {number}")
-            return FAILED
+            return Result.FAILED
         needs_place = mode in ("GUIDED", "LOITER", "RTL", "BRAKE", "POSHOLD")
         if mode == "AUTO" or (needs_place and not self.has_origin):
             why = "init failed" if mode == "AUTO" else "requires position"
             self.send_text(f"Mode change to {mode} failed: {why}")
-            return FAILED
+            return Result.FAILED
         self._set_mode(mode)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _go_by(self, manoeuvre: str) -> int:
         self._set_mode({"land": "LAND", "return": "RTL"}[manoeuvre])
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _disarmed(self) -> None:
         """Keep the mode: after a landing it is LAND, in which arming is not possible."""
@@ -244,25 +217,25 @@ class ArduCopter(Autopilot):
         if self.time_s < self._boot_s:
             self.send_text("Arm: Gyros inconsistent", CRITICAL)
             self.send_text("Arm: Need Position Estimate", CRITICAL)
-            return FAILED
+            return Result.FAILED
         if self.mode in _NOT_ARMABLE:
             self.send_text(f"Arm: {self.mode} mode not armable", CRITICAL)
-            return FAILED
+            return Result.FAILED
         if self.mode == "GUIDED" and not self.has_origin:
             self.send_text("Arm: Need Position Estimate", CRITICAL)
-            return FAILED
+            return Result.FAILED
         return None
 
     def _refuse_disarming(self) -> int:
-        return FAILED
+        return Result.FAILED
 
     def _take_off(self, arguments: Arguments) -> int:
         height = arguments[6]
         if self.mode != "GUIDED" or not self.armed or not self.flight.standing or not height > 0:
-            return FAILED
+            return Result.FAILED
         self._manoeuvres.begin_rise(self.home[2] + height)
         self._rising, self._target = True, None
-        return ACCEPTED
+        return Result.ACCEPTED
 
     # Set-points ------------------------------------------------------------------------------------------------
 
@@ -306,41 +279,41 @@ class ArduCopter(Autopilot):
 
     def _reposition(self, arguments: Arguments, frame: int) -> int:
         if self.mode != "GUIDED" and not whole(arguments[1]) & 1:
-            return DENIED
+            return Result.DENIED
         place = self._place(arguments, frame)
         if place is None or not _given(arguments):
-            return DENIED
-        if self.mode != "GUIDED" and self._change_mode((1, COPTER_NUMBERS["GUIDED"])) != ACCEPTED:
-            return FAILED
+            return Result.DENIED
+        if self.mode != "GUIDED" and self._change_mode((1, COPTER_NUMBERS["GUIDED"])) != Result.ACCEPTED:
+            return Result.FAILED
         self._go_to(Target(place))
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _set_home(self, arguments: Arguments, frame: int) -> int:
         here = arguments[0] == 1 or not _given(arguments)
         if not self.has_origin or not (here or arguments[0] == 0):
-            return FAILED
+            return Result.FAILED
         place = self.flight.place if here else self._place(arguments, frame)
         if place is None:
-            return DENIED
+            return Result.DENIED
         self._home_at(place)
         for number in (m.MAVLINK_MSG_ID_HOME_POSITION, m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN):
             made = self._requested(number)
             for port in self.ports:
                 port.send(made)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
         which, speed = arguments[:2]
         if self.mode not in ("GUIDED", "RTL") or not 0 < speed < math.inf:
-            return FAILED
+            return Result.FAILED
         changed = "down" if which > 2.9 else "up" if which > 1.9 else "across"
         self._speeds = replace(self._speeds, **{changed: speed})
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _condition_yaw(self, arguments: Arguments) -> int:
         angle, rate, way, relative = arguments[:4]
         if not 0 <= angle <= 360 or relative not in (0, 1):
-            return FAILED
+            return Result.FAILED
         if relative:
             clockwise = math.radians(angle) * (1 if way >= 0 else -1)
         else:
@@ -350,31 +323,31 @@ class ArduCopter(Autopilot):
             elif clockwise < 0 < way:
                 clockwise += math.tau
         self._turn = Turn(self.flight, -clockwise, min(TURN_RAD_S, math.radians(rate)) if rate > 0 else TURN_RAD_S)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _pause_or_continue(self, arguments: Arguments) -> int:
         order = whole(arguments[0])
         if order not in (0, 1):
-            return DENIED
+            return Result.DENIED
         if self.mode != "GUIDED":
             self.send_text(f"Failed to {'resume' if order else 'pause'}", INFO)
-            return FAILED
+            return Result.FAILED
         self._paused = not order
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  it has none
         major, minor = self.VERSION >> 24, self.VERSION >> 16 & 0xFF
         for text in (f"ArduCopter V{major}.{minor}.0-dev (emulated by Skyloop)", "Frame: QUAD/X"):
             self.send_text(text, INFO)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _reboot(self, arguments: Arguments) -> int:
         if self.armed or whole(arguments[0]) not in (1, 3):
-            return FAILED
+            return Result.FAILED
         self._set_mode("STABILIZE")
         self._stick, self._overrides, self.failsafe = None, {}, False
         self._restart()  # keeps the mission and parameters
-        return ACCEPTED
+        return Result.ACCEPTED
 
     @property
     def channels(self) -> list[int] | None:
@@ -398,20 +371,20 @@ class ArduCopter(Autopilot):
         scale = 1e7 if message.get_type() == "MISSION_ITEM_INT" else 1.0
         latitude, longitude = message.x / scale, message.y / scale
         if not abs(latitude) <= 90:
-            return MISSION_INVALID_X
+            return MissionResult.INVALID_X
         if not abs(longitude) <= 180:
-            return MISSION_INVALID_Y
+            return MissionResult.INVALID_Y
         if not math.isfinite(message.z):
-            return MISSION_INVALID_Z
+            return MissionResult.INVALID_Z
         place = self._place((0.0, 0.0, 0.0, 0.0, latitude, longitude, message.z), message.frame)
         if place is None:
-            return MISSION_UNSUPPORTED
+            return MissionResult.UNSUPPORTED
         if message.current == _ALTITUDE_ITEM:
-            return MISSION_ACCEPTED  # accepted without any effect
+            return MissionResult.ACCEPTED  # accepted without any effect
         if self.mode != "GUIDED" or message.command != m.MAV_CMD_NAV_WAYPOINT:
-            return MISSION_ERROR
+            return MissionResult.ERROR
         self._go_to(Target(place))
-        return MISSION_ACCEPTED
+        return MissionResult.ACCEPTED
 
     # Losing the ground station ---------------------------------------------------------------------------------
 

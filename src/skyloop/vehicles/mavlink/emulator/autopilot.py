@@ -6,34 +6,27 @@ Times are on the autopilot's clock in simulated seconds, so that everything runs
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
+from enum import IntEnum
 from typing import ClassVar, Final
 
 from skyloop.messages import FlightState
 from skyloop.sim.host import Report
-from skyloop.vehicles.emulation.flight import FlightControl, Vehicle
+from skyloop.vehicles.emulation.flight import Vehicle
 from skyloop.vehicles.mavlink.emulator.links import MAX_INTERVAL_US, Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, Manoeuvres, on_earth, place_of
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable, answers
-from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS
+from skyloop.vehicles.mavlink.emulator.telemetry import MAKERS, POSE_GAP_S, AutopilotState
 from skyloop.vehicles.mavlink.wire.axes import Vector
 from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import ModeFlag, SystemState
 
-ACCEPTED: Final = 0
-TEMPORARILY_REJECTED: Final = 1
-DENIED: Final = 2
-UNSUPPORTED: Final = 3
-FAILED: Final = 4
 FORCE: Final = 21196  #: parameter of the disarm command that means "even in flight"
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
 AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until it disarms
-POSES_S: Final = 1.0  #: without GPS, how long external poses must arrive before the position is known
-POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
 _GCS: Final = 6  #: MAV_TYPE of a ground station
 #: Messages that the old request for all messages does not affect.
 _ON_REQUEST: Final = (
@@ -42,7 +35,6 @@ _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_HOME_POSITION,
     m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
 )
-_COPIES: Final = 1 << 32
 _NOT_GIVEN: Final = 0x7FFFFFFF  #: value that means "no position" in COMMAND_INT, like NaN in COMMAND_LONG
 
 Arguments = tuple[float, ...]
@@ -50,10 +42,19 @@ Handler = Callable[[Arguments], int]
 PlaceHandler = Callable[[Arguments, int], int]
 
 
-class Autopilot(ABC):
+class Result(IntEnum):
+    """Values of ``MAV_RESULT``."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class Autopilot(AutopilotState):
     """One autopilot. All methods belong to one thread. Set ``ports`` (its links) before the first report."""
 
-    AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     CAPABILITIES: ClassVar[int]
     VERSION: ClassVar[int]
     RATES: ClassVar[dict[int, float]]  #: rates of the messages sent on a new link without being requested [1/s]
@@ -63,33 +64,24 @@ class Autopilot(ABC):
     LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of the position in COMMAND_LONG, for each command that accepts one
     NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
-    REPORTS_PREARM: ClassVar[bool] = True  #: whether SYS_STATUS marks the pre-arm check as present
     DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
+    WORDS: ClassVar[dict[str, str]]  #: its texts when it is armed, disarmed, auto_disarm (on the ground) or landed
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
-        self.flight = FlightControl(vehicle)
+        super().__init__(vehicle, boot_s, gps)
         self.system = system
-        self.gps = gps
         self.ports: tuple[Port, ...] = ()
         self.parameters: ParameterTable
-        self.report: Report
-        self.armed = False
         self.mode = ""
-        self.failsafe = False
         self.poses = 0  #: number of external poses received
         self.set_points = 0  #: number of set-points accepted
-        self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up from the flight's origin
         self._home_given = False  # whether home was set by a command, so that arming leaves it unchanged
         self._manoeuvres = Manoeuvres(self.flight)
-        self._boot_s = boot_s
-        self._begun_s: float | None = None
         self._captured_ns = 0
         self._armed_s = 0.0
         self._landed_s: float | None = None
         self._flown = False  # whether it has flown since it was armed
         self._gcs_s: float | None = None
-        self._pose_s = -math.inf
-        self._posing_s = math.inf
         self._text = 0
         self._commands: dict[int, Handler] = {
             m.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
@@ -103,66 +95,6 @@ class Autopilot(ABC):
             m.MAV_CMD_DO_REPOSITION: self._reposition,
             m.MAV_CMD_DO_SET_HOME: self._set_home,
         }
-
-    # Time and state --------------------------------------------------------------------------------------------
-
-    @property
-    def time_s(self) -> float:
-        """Time since it was switched on [s]."""
-        return 0.0 if self._begun_s is None else self.report.believed.time_s - self._begun_s
-
-    @property
-    def boot_ms(self) -> int:
-        """Time since it was switched on, as in 32-bit message fields [ms]."""
-        return round(self.time_s * 1000) % _COPIES
-
-    @property
-    def boot_ns(self) -> int:
-        """Time since it was switched on [ns]."""
-        return round(self.time_s * 1e9)
-
-    @property
-    def has_origin(self) -> bool:
-        """Whether it has a position."""
-        if self.gps:
-            return self.time_s >= self._boot_s / 2
-        return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
-
-    @property
-    def settled(self) -> bool:
-        """Whether its estimator reports a good position, which is the last step of booting."""
-        return self.time_s >= self._boot_s and self.has_origin
-
-    @property
-    def ready(self) -> bool:
-        """Whether it can be armed."""
-        return self.settled and self.mode_allows_arming
-
-    @property
-    def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its present mode."""
-        return True
-
-    @property
-    def remote(self) -> bool:
-        """Whether it reports that it receives a remote control."""
-        return False
-
-    @property
-    def base_mode(self) -> int:
-        """The heartbeat's ``MAV_MODE_FLAG`` bits."""
-        return int(ModeFlag.CUSTOM | (ModeFlag.ARMED if self.armed else 0))
-
-    @property
-    def system_status(self) -> int:
-        """The heartbeat's ``MAV_STATE``."""
-        if self.failsafe:
-            return SystemState.CRITICAL
-        return SystemState.ACTIVE if self.armed else SystemState.STANDBY
-
-    @property
-    @abstractmethod
-    def custom_mode(self) -> int: ...
 
     # Time passes -----------------------------------------------------------------------------------------------
 
@@ -193,11 +125,11 @@ class Autopilot(ABC):
             return
         if not self._flown:
             if self.time_s - self._armed_s > self.DISARM_S:
-                self._disarm(self._words("auto_disarm"))
+                self._disarm(self.WORDS["auto_disarm"])
         elif self._landed_s is None:
             self._landed_s = self.time_s
         elif self.time_s - self._landed_s > AFTER_LANDING_S:
-            self._disarm(self._words("landed"))
+            self._disarm(self.WORDS["landed"])
 
     def _check_ground_station(self) -> None:
         lost = self._gcs_s is not None and self.time_s - self._gcs_s > self._gcs_patience_s
@@ -277,11 +209,6 @@ class Autopilot(ABC):
         for port in self.ports:
             port.streams.reset()
 
-    @property
-    def channels(self) -> list[int] | None:
-        """The remote control's pulse widths [µs]; None if it reports none."""
-        return None
-
     def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
         """Handle a message that only one of the two autopilots supports; return whether it was handled."""
         return False
@@ -319,19 +246,19 @@ class Autopilot(ABC):
             result = self._set_interval(port, whole(arguments[0]), arguments[1])
         elif number == m.MAV_CMD_GET_MESSAGE_INTERVAL:
             answer = self._interval(port, whole(arguments[0]))
-            result = ACCEPTED if answer is not None else FAILED
+            result = Result.ACCEPTED if answer is not None else Result.FAILED
         elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
             answer = self._requested(asked)
-            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
         elif number == m.MAV_CMD_GET_HOME_POSITION:
             answer = self._requested(m.MAVLINK_MSG_ID_HOME_POSITION)
-            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
         elif number in self._placed_commands:
-            result = UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
+            result = Result.UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
         else:
             handler = self._commands.get(number)
-            result = UNSUPPORTED if handler is None else handler(arguments)
+            result = Result.UNSUPPORTED if handler is None else handler(arguments)
         sender = message.get_srcSystem(), message.get_srcComponent()
         port.send(m.MAVLink_command_ack_message(number, result, 0, 0, *sender))
         if answer is not None:
@@ -354,23 +281,23 @@ class Autopilot(ABC):
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
         if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # the comparison is also false for NaN
-            return FAILED
+            return Result.FAILED
         port.streams.set_interval(number, interval_us)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _arm_or_disarm(self, arguments: Arguments) -> int:
         forced = whole(arguments[1]) == FORCE
         if arguments[0] >= 0.5:
-            return ACCEPTED if self.armed else self._arm(forced)
+            return Result.ACCEPTED if self.armed else self._arm(forced)
         if not self.armed:
-            return ACCEPTED
+            return Result.ACCEPTED
         if self.flight.standing:
             self._disarm("")
-            return ACCEPTED
+            return Result.ACCEPTED
         if forced:
             self.flight.cut()
-            self._disarm(self._words("forced"))
-            return ACCEPTED
+            self._disarm("")
+            return Result.ACCEPTED
         return self._refuse_disarming()
 
     def _arm(self, forced: bool) -> int:
@@ -380,12 +307,12 @@ class Autopilot(ABC):
         self.armed, self._armed_s, self._flown, self._landed_s = True, self.time_s, False, None
         if not self._home_given:
             self.home = self.flight.place
-        self.send_text(self._words("armed"), INFO)
-        return ACCEPTED
+        self.send_text(self.WORDS["armed"], INFO)
+        return Result.ACCEPTED
 
     def _disarm(self, text: str) -> None:
         self.armed = False
-        self.send_text(text or self._words("disarmed"), INFO)
+        self.send_text(text or self.WORDS["disarmed"], INFO)
         self._disarmed()
 
     def crashed(self, text: str) -> None:
@@ -396,10 +323,6 @@ class Autopilot(ABC):
     @abstractmethod
     def _disarmed(self) -> None:
         """Change the mode after disarming."""
-
-    @abstractmethod
-    def _words(self, occasion: str) -> str:
-        """Return the autopilot's text for an occasion: armed, disarmed, auto_disarm, landed or forced."""
 
     @abstractmethod
     def _refuse_arming(self) -> int | None:

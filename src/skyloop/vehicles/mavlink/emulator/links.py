@@ -13,7 +13,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
-from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort, Loop
+from skyloop.vehicles.emulation.emulator import Address, ByteServer, DatagramPort, Loop
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
@@ -44,17 +44,9 @@ class Ports:
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports numbered from a base, which increases by 10 with each drone.
+        """Return ports numbered from a base, which increases by 10 with each drone: its UDP port, the remote one, TCP.
 
-        The autopilot's own UDP port comes first, then the remote one, then TCP.
-
-        Args:
-            kind: The autopilot.
-            base: The first port; None for the standard ones, 0 for any free ones.
-            drone: The drone's number.
-
-        Raises:
-            UsageError: A port would be greater than 65535.
+        The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` beyond port 65535.
         """
         if base is None:
             return cls.standard(kind, drone)
@@ -93,10 +85,8 @@ def _free(held: ExitStack, kind: socket.SocketKind) -> int:
 def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPORTS_HZ) -> SimOptions:
     """Return the options for a world of emulated autopilots, which has no cameras.
 
-    Args:
-        options: Options of the world and its drones.
-        rate_hz: Rate at which an autopilot runs [1/s], by default the highest possible. A lower rate makes a fleet
-            cheaper but also limits the rate of every message.
+    ``rate_hz`` is the rate at which an autopilot runs, by default the highest possible. A lower rate makes a fleet
+    cheaper but also limits the rate of every message.
     """
     return replace(options or SimOptions(), rate_hz=rate_hz, cameras=())
 
@@ -209,16 +199,13 @@ class UdpPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
         return self._port.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the peer."""
         if self._settings.carries(message):
             self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
 
     def close(self) -> None:
-        """Close the port."""
         self._port.close()
 
     def _receive(self, datagram: bytes, sender: Address) -> None:
@@ -246,16 +233,13 @@ class TcpPort:
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the client, if any."""
         if self._settings.carries(message):
             self._server.send(self._codec.encode(message, version=self._settings.version))
 
     def close(self) -> None:
-        """Close the server and the connection."""
         self._server.close()
 
     def _begin(self) -> None:

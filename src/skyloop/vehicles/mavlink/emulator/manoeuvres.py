@@ -160,13 +160,7 @@ class _Return:
 
 
 class Turn:
-    """A turn by an angle from the present heading.
-
-    Args:
-        flight: The flight to turn.
-        angle: Angle, positive counter-clockwise [rad]; may be more than half a turn.
-        fastest: Maximum yaw rate [rad/s].
-    """
+    """A turn by an angle from the present heading [rad]: positive counter-clockwise, maybe more than half a turn."""
 
     def __init__(self, flight: FlightControl, angle: float, fastest: float) -> None:
         self._flyer, self._fastest = flight, fastest
@@ -204,13 +198,9 @@ class Manoeuvres:
         return up >= self._rise_m - 0.1
 
     def begin_return(self, home: Vector, height_m: float, *, wait_s: float = 0.0, final_m: float | None = None) -> None:
-        """Start returning: climb, fly home at that height, wait there, and land.
+        """Start returning: climb, fly to ``home`` at that height, or as high as it can, wait there, and land.
 
-        Args:
-            home: East, north, up from the origin [m].
-            height_m: Height to fly home at, limited to what the vehicle can reach.
-            wait_s: Time to wait above home.
-            final_m: Height to descend to instead of landing; None to land.
+        ``final_m`` is the height to descend to instead of landing; None to land.
         """
         self._return = _Return(self._flyer.place, home, min(height_m, self._flyer.highest_m), wait_s, final_m)
 

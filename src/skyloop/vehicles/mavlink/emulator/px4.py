@@ -7,18 +7,7 @@ from typing import ClassVar, Final
 
 from skyloop.vehicles.emulation.flight import USUAL, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import (
-    ACCEPTED,
-    CRITICAL,
-    DENIED,
-    FAILED,
-    INFO,
-    TEMPORARILY_REJECTED,
-    UNSUPPORTED,
-    Arguments,
-    Autopilot,
-    whole,
-)
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -33,10 +22,9 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
+from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
-from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate if there is no remote control
 STICK_SPEED_M_S: Final = 10.0  #: speed at full stick (MPC_VEL_MANUAL)
@@ -44,13 +32,6 @@ STICK_EXPO: Final = 0.6  #: how much a stick's response is flattened near its ce
 STICK_FILTER_S: Final = 0.1  #: time constant of the filter for a stick's speed
 LIFTS_OFF_AT: Final = 0.2  #: throttle at which it lifts off, as a fraction of the stick's travel upwards
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
-_WORDS: Final = {
-    "armed": "Armed by external command",
-    "disarmed": "Disarmed by external command",
-    "auto_disarm": "Disarmed by auto preflight disarming",
-    "landed": "Disarmed by landing",
-    "forced": "Disarmed by external command",
-}
 
 
 class Px4(Autopilot):
@@ -82,10 +63,16 @@ class Px4(Autopilot):
     ABOVE_SEA = frozenset({5})
     ABOVE_HOME = frozenset({6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_REPOSITION: 5, m.MAV_CMD_DO_SET_HOME: 5}
-    NOTHING_TO_TELL = DENIED
+    NOTHING_TO_TELL = Result.DENIED
     BYTEWISE = True
     DISARM_S = 11.1
     REPORTS_PREARM = False
+    WORDS: ClassVar[dict[str, str]] = {
+        "armed": "Armed by external command",
+        "disarmed": "Disarmed by external command",
+        "auto_disarm": "Disarmed by auto preflight disarming",
+        "landed": "Disarmed by landing",
+    }
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
@@ -105,7 +92,6 @@ class Px4(Autopilot):
 
     @property
     def custom_mode(self) -> int:
-        """The mode's number."""
         return px4_custom(self.mode)
 
     @property
@@ -115,9 +101,6 @@ class Px4(Autopilot):
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
         return True
-
-    def _words(self, occasion: str) -> str:
-        return _WORDS[occasion]
 
     @property
     def _fresh(self) -> bool:
@@ -218,7 +201,7 @@ class Px4(Autopilot):
         main, sub = whole(arguments[1]), whole(arguments[2]) if len(arguments) > 2 else 0
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if mode is None or mode == "AUTO.READY":
-            return ACCEPTED
+            return Result.ACCEPTED
         if mode == "OFFBOARD" and not self._fresh:
             self.send_text("Switching to Offboard is currently not available", CRITICAL)
         elif mode in _STICKS and self.armed and not self.remote:
@@ -229,11 +212,11 @@ class Px4(Autopilot):
             if mode == "AUTO.TAKEOFF":
                 self._manoeuvres.begin_rise(self.home[2] + self.parameters["MIS_TAKEOFF_ALT"])
             self._set_mode(mode)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _go_by(self, manoeuvre: str) -> int:
         self._set_mode({"land": "AUTO.LAND", "return": "AUTO.RTL"}[manoeuvre])
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _disarmed(self) -> None:
         if self.mode in ("AUTO.LAND", "AUTO.RTL", "AUTO.TAKEOFF"):
@@ -245,11 +228,11 @@ class Px4(Autopilot):
         if self.ready:
             return None
         self.send_text("Arming denied: Resolve system health failures first\t", CRITICAL)
-        return TEMPORARILY_REJECTED
+        return Result.TEMPORARILY_REJECTED
 
     def _refuse_disarming(self) -> int:
         self.send_text("Disarming denied: not landed\t", CRITICAL)
-        return TEMPORARILY_REJECTED
+        return Result.TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
         """Take off, whether or not the vehicle is armed, and on the ground or in the air."""
@@ -258,7 +241,7 @@ class Px4(Autopilot):
         height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
         self._manoeuvres.begin_rise(max(0.5, height))
         self._set_mode("AUTO.TAKEOFF")
-        return ACCEPTED
+        return Result.ACCEPTED
 
     # Set-points ------------------------------------------------------------------------------------------------
 
@@ -291,11 +274,11 @@ class Px4(Autopilot):
     def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
         """Enter HOLD at another position. While disarmed, this changes only the mode."""
         if whole(arguments[1]) != 1:
-            return UNSUPPORTED
+            return Result.UNSUPPORTED
         fresh = self.mode != "AUTO.LOITER"
         self._set_mode("AUTO.LOITER")
         if not self.armed:
-            return ACCEPTED
+            return Result.ACCEPTED
         speed = arguments[0]
         if speed > 0:
             self._speeds = Speeds(across=speed)
@@ -312,24 +295,24 @@ class Px4(Autopilot):
             up = altitude - ORIGIN.altitude_m
         yaw = yaw_between(arguments[3]) if math.isfinite(arguments[3]) else None
         self._waiting_at = Target((east, north, up), yaw=yaw)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
         if arguments[0] > 0.5:
             place = self.flight.place
         elif not all(map(math.isfinite, arguments[4:7])):
-            return DENIED
+            return Result.DENIED
         else:
             place = place_of(arguments[4], arguments[5], arguments[6] - ORIGIN.altitude_m)
         if not self.has_origin:
-            return TEMPORARILY_REJECTED
+            return Result.TEMPORARILY_REJECTED
         self._home_at(place)
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
         """Change the speed. The command is accepted even if it has no effect."""
         self._speeds = Speeds(across=arguments[1]) if 0 < arguments[1] < math.inf else USUAL
-        return ACCEPTED
+        return Result.ACCEPTED
 
     def _own(self, port: Port, message: Message) -> bool:
         if message.get_type() != "PING" or message.target_system or message.target_component:
@@ -419,5 +402,5 @@ class Px4(Autopilot):
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
         if number == m.MAVLINK_MSG_ID_HEARTBEAT:
-            return FAILED
+            return Result.FAILED
         return super()._set_interval(port, number, interval_us)

@@ -8,23 +8,16 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Iterable, Mapping
+from enum import IntEnum
 from typing import Final
 
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.wire.codec import REAL32, Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-MISSION_ACCEPTED: Final = 0
-MISSION_ERROR: Final = 1
-MISSION_UNSUPPORTED: Final = 3
-MISSION_NO_SPACE: Final = 4
-MISSION_INVALID_SEQUENCE: Final = 13
 MOST_ITEMS: Final = 500  #: maximum number of items in a mission
 _SCALE: Final = 1e7  #: scale of latitude and longitude in MISSION_ITEM_INT
 _HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
-MISSION_INVALID_X: Final = 10
-MISSION_INVALID_Y: Final = 11
-MISSION_INVALID_Z: Final = 12
 
 # The file protocol's requests and replies.
 _END_SESSION: Final = 1
@@ -47,6 +40,19 @@ _DATA: Final = 12
 _PAYLOAD: Final = 251
 
 
+class MissionResult(IntEnum):
+    """Values of ``MAV_MISSION_RESULT``."""
+
+    ACCEPTED = 0
+    ERROR = 1
+    UNSUPPORTED = 3
+    NO_SPACE = 4
+    INVALID_X = 10
+    INVALID_Y = 11
+    INVALID_Z = 12
+    INVALID_SEQUENCE = 13
+
+
 def mission_ack(message: Message, result: int) -> Message:
     """Return a ``MISSION_ACK`` addressed to a message's sender."""
     kind = getattr(message, "mission_type", 0)
@@ -54,11 +60,7 @@ def mission_ack(message: Message, result: int) -> Message:
 
 
 class Mission:
-    """A mission stored as in ArduCopter: item 0 is always home, even after an upload.
-
-    Attributes:
-        current: The number of the next item to fly.
-    """
+    """A mission stored as in ArduCopter: item 0 is always home, even after an upload."""
 
     def __init__(self) -> None:
         self.current = 0
@@ -76,22 +78,22 @@ class Mission:
             return [m.MAVLink_mission_count_message(*sender, len(self._items) + 1, 0)]
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
             if not 0 <= message.seq <= len(self._items):
-                return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+                return [mission_ack(message, MissionResult.INVALID_SEQUENCE)]
             return [self._item(message.seq, sender, home, whole=kind == "MISSION_REQUEST_INT")]
         if kind == "MISSION_COUNT":
             self._coming, self._wanted = [], 0
             if message.count > MOST_ITEMS:
-                return [mission_ack(message, MISSION_NO_SPACE)]
+                return [mission_ack(message, MissionResult.NO_SPACE)]
             if not message.count:
                 self._items = []
-                return [mission_ack(message, MISSION_ACCEPTED)]
+                return [mission_ack(message, MissionResult.ACCEPTED)]
             self._wanted = message.count
             return [m.MAVLink_mission_request_message(*sender, 0, 0)]
         if kind in ("MISSION_ITEM", "MISSION_ITEM_INT") and self._wanted:
             return self._take(message, sender)
         if kind == "MISSION_CLEAR_ALL":
             self._items, self._wanted, self.current = [], 0, 0
-            return [mission_ack(message, MISSION_ACCEPTED)]
+            return [mission_ack(message, MissionResult.ACCEPTED)]
         if kind == "MISSION_SET_CURRENT":
             if not 0 <= message.seq <= len(self._items):
                 return []
@@ -101,12 +103,12 @@ class Mission:
 
     def _take(self, message: Message, sender: tuple[int, int]) -> list[Message]:
         if message.seq != len(self._coming):
-            return [mission_ack(message, MISSION_INVALID_SEQUENCE)]
+            return [mission_ack(message, MissionResult.INVALID_SEQUENCE)]
         self._coming.append(message)
         if len(self._coming) < self._wanted:
             return [m.MAVLink_mission_request_message(*sender, len(self._coming), 0)]
         self._items, self._coming, self._wanted, self.current = self._coming[1:], [], 0, 0
-        return [mission_ack(message, MISSION_ACCEPTED)]
+        return [mission_ack(message, MissionResult.ACCEPTED)]
 
     def _item(self, number: int, sender: tuple[int, int], home: tuple[int, int, int], *, whole: bool) -> Message:
         if number == 0:
@@ -131,11 +133,11 @@ def answers(message: Message) -> Iterable[Message]:
     if kind == "MISSION_REQUEST_LIST":
         yield m.MAVLink_mission_count_message(*sender, 0, message.mission_type)
     elif kind == "MISSION_COUNT":  # an upload; an empty one does not clear anything
-        yield mission_ack(message, MISSION_UNSUPPORTED if message.count else MISSION_ACCEPTED)
+        yield mission_ack(message, MissionResult.UNSUPPORTED if message.count else MissionResult.ACCEPTED)
     elif kind == "MISSION_CLEAR_ALL":
-        yield mission_ack(message, MISSION_ACCEPTED)
+        yield mission_ack(message, MissionResult.ACCEPTED)
     elif kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ITEM", "MISSION_ITEM_INT"):
-        yield mission_ack(message, MISSION_ERROR)  # an item that was not requested
+        yield mission_ack(message, MissionResult.ERROR)  # an item that was not requested
     elif kind == "LOG_REQUEST_LIST":
         yield m.MAVLink_log_entry_message(0, 0, 0, 0, 0)
     elif kind == "FILE_TRANSFER_PROTOCOL":
@@ -169,73 +171,30 @@ INT8: Final = 2
 INT16: Final = 4
 INT32: Final = 6
 
+
+def _all(kind: int, **values: float) -> dict[str, tuple[float, int]]:
+    return {name: (value, kind) for name, value in values.items()}
+
+
 #: Default value and MAV_PARAM_TYPE of each parameter in ArduCopter 4.7-dev.
-ARDUCOPTER: Final[dict[str, tuple[float, int]]] = {
-    "ANGLE_MAX": (3000, INT16),
-    "ARMING_CHECK": (1, INT32),
-    "ATC_RATE_Y_MAX": (0.0, REAL32),
-    "BATT_CRT_VOLT": (0.0, REAL32),
-    "BATT_FS_CRT_ACT": (0, INT8),
-    "BATT_FS_LOW_ACT": (0, INT8),
-    "BATT_LOW_VOLT": (10.5, REAL32),
-    "DISARM_DELAY": (10, INT8),
-    "EK3_SRC1_POSXY": (3, INT8),
-    "FENCE_ACTION": (1, INT8),
-    "FENCE_ALT_MAX": (100.0, REAL32),
-    "FENCE_ENABLE": (0, INT8),
-    "FS_EKF_ACTION": (1, INT8),
-    "FS_EKF_THRESH": (0.8, REAL32),
-    "FS_GCS_ENABLE": (0, INT8),
-    "FS_GCS_TIMEOUT": (5.0, REAL32),
-    "FS_OPTIONS": (16, INT32),
-    "FS_THR_ENABLE": (1, INT8),
-    "GUID_OPTIONS": (0, INT32),
-    "GUID_TIMEOUT": (3.0, REAL32),
-    "LAND_SPEED": (50, INT16),
-    "MAV_GCS_SYSID": (255, INT16),
-    "MOT_SPIN_ARM": (0.1, REAL32),
-    "MOT_SPIN_MIN": (0.15, REAL32),
-    "RTL_ALT": (1500, INT32),
-    "RTL_ALT_FINAL": (0, INT16),
-    "RTL_CLIMB_MIN": (0, INT16),
-    "RTL_CONE_SLOPE": (3.0, REAL32),
-    "RTL_LOIT_TIME": (5000, INT32),
-    "WPNAV_SPEED": (1000.0, REAL32),
-    "WPNAV_SPEED_DN": (150.0, REAL32),
-    "WPNAV_SPEED_UP": (250.0, REAL32),
+ARDUCOPTER: Final = {
+    **_all(INT16, ANGLE_MAX=3000, LAND_SPEED=50, MAV_GCS_SYSID=255, RTL_ALT_FINAL=0, RTL_CLIMB_MIN=0),
+    **_all(INT32, ARMING_CHECK=1, FS_OPTIONS=16, GUID_OPTIONS=0, RTL_ALT=1500, RTL_LOIT_TIME=5000),
+    **_all(REAL32, ATC_RATE_Y_MAX=0.0, BATT_CRT_VOLT=0.0, BATT_LOW_VOLT=10.5, FENCE_ALT_MAX=100.0, FS_EKF_THRESH=0.8),
+    **_all(REAL32, FS_GCS_TIMEOUT=5.0, GUID_TIMEOUT=3.0, MOT_SPIN_ARM=0.1, MOT_SPIN_MIN=0.15, RTL_CONE_SLOPE=3.0),
+    **_all(REAL32, WPNAV_SPEED=1000.0, WPNAV_SPEED_DN=150.0, WPNAV_SPEED_UP=250.0),
+    **_all(INT8, BATT_FS_CRT_ACT=0, BATT_FS_LOW_ACT=0, DISARM_DELAY=10, EK3_SRC1_POSXY=3, FENCE_ACTION=1),
+    **_all(INT8, FENCE_ENABLE=0, FS_EKF_ACTION=1, FS_GCS_ENABLE=0, FS_THR_ENABLE=1),
 }
 #: Default value and MAV_PARAM_TYPE of each parameter in PX4 1.17.
-PX4: Final[dict[str, tuple[float, int]]] = {
-    "COM_DISARM_LAND": (2.0, REAL32),
-    "COM_DISARM_PRFLT": (10.0, REAL32),
-    "COM_DL_LOSS_T": (10, INT32),
-    "COM_FAIL_ACT_T": (5.0, REAL32),
-    "COM_LOW_BAT_ACT": (0, INT32),
-    "COM_OBL_RC_ACT": (0, INT32),
-    "COM_OF_LOSS_T": (1.0, REAL32),
-    "COM_RCL_EXCEPT": (0, INT32),
-    "COM_RC_LOSS_T": (0.5, REAL32),
-    "COM_RC_OVERRIDE": (1, INT32),
-    "COM_RC_STICK_OV": (30.0, REAL32),
-    "EKF2_EV_CTRL": (15, INT32),
-    "GF_ACTION": (2, INT32),
-    "GF_MAX_VER_DIST": (0.0, REAL32),
-    "MIS_TAKEOFF_ALT": (2.5, REAL32),
-    "MPC_MAN_Y_MAX": (150.0, REAL32),
-    "MPC_THR_HOVER": (0.5, REAL32),
-    "MPC_TILTMAX_AIR": (45.0, REAL32),
-    "MPC_XY_VEL_MAX": (12.0, REAL32),
-    "MPC_Z_VEL_MAX_DN": (1.5, REAL32),
-    "MPC_Z_VEL_MAX_UP": (3.0, REAL32),
-    "NAV_ACC_RAD": (2.0, REAL32),
-    "NAV_DLL_ACT": (0, INT32),
-    "NAV_RCL_ACT": (2, INT32),
-    "RTL_CONE_ANG": (45, INT32),
-    "RTL_DESCEND_ALT": (10.0, REAL32),
-    "RTL_LAND_DELAY": (0.0, REAL32),
-    "RTL_MIN_DIST": (10.0, REAL32),
-    "RTL_RETURN_ALT": (30.0, REAL32),
-    "SYS_AUTOSTART": (10040, INT32),
+PX4: Final = {
+    **_all(REAL32, COM_DISARM_LAND=2.0, COM_DISARM_PRFLT=10.0, COM_FAIL_ACT_T=5.0, COM_OF_LOSS_T=1.0),
+    **_all(REAL32, COM_RC_LOSS_T=0.5, COM_RC_STICK_OV=30.0, GF_MAX_VER_DIST=0.0, MIS_TAKEOFF_ALT=2.5),
+    **_all(REAL32, MPC_MAN_Y_MAX=150.0, MPC_THR_HOVER=0.5, MPC_TILTMAX_AIR=45.0, MPC_XY_VEL_MAX=12.0),
+    **_all(REAL32, MPC_Z_VEL_MAX_DN=1.5, MPC_Z_VEL_MAX_UP=3.0, NAV_ACC_RAD=2.0, RTL_DESCEND_ALT=10.0),
+    **_all(REAL32, RTL_LAND_DELAY=0.0, RTL_MIN_DIST=10.0, RTL_RETURN_ALT=30.0),
+    **_all(INT32, COM_DL_LOSS_T=10, COM_LOW_BAT_ACT=0, COM_OBL_RC_ACT=0, COM_RCL_EXCEPT=0, COM_RC_OVERRIDE=1),
+    **_all(INT32, EKF2_EV_CTRL=15, GF_ACTION=2, NAV_DLL_ACT=0, NAV_RCL_ACT=2, RTL_CONE_ANG=45, SYS_AUTOSTART=10040),
 }
 
 

@@ -1,21 +1,21 @@
-"""MAVLink messages made from the simulation's reports, by message number. Pure."""
+"""An autopilot's state by the simulation's reports, and the MAVLink messages made from it, by number. Pure."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import in_16_bits, quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
-from skyloop.vehicles.emulation.flight import FlightControl
+from skyloop.vehicles.emulation.flight import FlightControl, Vehicle
 from skyloop.vehicles.mavlink.emulator.manoeuvres import ORIGIN, geodetic
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Message
+from skyloop.vehicles.mavlink.wire.codec import Landed, Message, ModeFlag, SystemState
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
-from skyloop.vehicles.mavlink.wire.modes import Landed
 
 PREARM: Final = 0x10000000
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
@@ -24,6 +24,9 @@ _BATTERY: Final = 0x2000000
 #: Estimator flags for a known position: relative and absolute, now and predicted for the air. DroneKit waits for the
 #: last one.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
+POSES_S: Final = 1.0  #: without GPS, how long external poses must arrive before the position is known
+POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
+_COPIES: Final = 1 << 32
 _LANDED: Final = {
     FlightState.LANDED: Landed.ON_GROUND,
     FlightState.EMERGENCY: Landed.ON_GROUND,
@@ -32,36 +35,86 @@ _LANDED: Final = {
 }
 
 
-class AutopilotState(Protocol):
-    """The state from which messages are made; see :class:`skyloop.vehicles.mavlink.emulator.autopilot.Autopilot`."""
+class AutopilotState(ABC):
+    """An autopilot's state, from which messages are made. Times are on its own clock [s]."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
-    REPORTS_PREARM: ClassVar[bool]
-    flight: FlightControl
-    gps: bool
-    report: Report
-    home: Vector  #: east, north, up from the flight's origin [m]
+    REPORTS_PREARM: ClassVar[bool] = True  #: whether SYS_STATUS marks the pre-arm check as present
+
+    def __init__(self, vehicle: Vehicle, boot_s: float, gps: bool) -> None:
+        self.flight = FlightControl(vehicle)
+        self.gps = gps
+        self.report: Report
+        self.armed = False
+        self.failsafe = False
+        self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up from the flight's origin [m]
+        self._boot_s = boot_s
+        self._begun_s: float | None = None
+        self._pose_s = -math.inf
+        self._posing_s = math.inf
 
     @property
-    def boot_ms(self) -> int: ...
+    def time_s(self) -> float:
+        """Time since it was switched on [s]."""
+        return 0.0 if self._begun_s is None else self.report.believed.time_s - self._begun_s
+
     @property
-    def boot_ns(self) -> int: ...
+    def boot_ms(self) -> int:
+        """Time since it was switched on, as in 32-bit message fields [ms]."""
+        return round(self.time_s * 1000) % _COPIES
+
     @property
-    def base_mode(self) -> int: ...
+    def boot_ns(self) -> int:
+        """Time since it was switched on [ns]."""
+        return round(self.time_s * 1e9)
+
     @property
+    def has_origin(self) -> bool:
+        """Whether it has a position."""
+        if self.gps:
+            return self.time_s >= self._boot_s / 2
+        return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
+
+    @property
+    def settled(self) -> bool:
+        """Whether its estimator reports a good position, which is the last step of booting."""
+        return self.time_s >= self._boot_s and self.has_origin
+
+    @property
+    def ready(self) -> bool:
+        """Whether it can be armed."""
+        return self.settled and self.mode_allows_arming
+
+    @property
+    def mode_allows_arming(self) -> bool:
+        """Whether it can be armed in its present mode."""
+        return True
+
+    @property
+    def remote(self) -> bool:
+        """Whether it reports that it receives a remote control."""
+        return False
+
+    @property
+    def base_mode(self) -> int:
+        """The heartbeat's ``MAV_MODE_FLAG`` bits."""
+        return int(ModeFlag.CUSTOM | (ModeFlag.ARMED if self.armed else 0))
+
+    @property
+    def system_status(self) -> int:
+        """The heartbeat's ``MAV_STATE``."""
+        if self.failsafe:
+            return SystemState.CRITICAL
+        return SystemState.ACTIVE if self.armed else SystemState.STANDBY
+
+    @property
+    @abstractmethod
     def custom_mode(self) -> int: ...
+
     @property
-    def system_status(self) -> int: ...
-    @property
-    def has_origin(self) -> bool: ...
-    @property
-    def ready(self) -> bool: ...
-    @property
-    def settled(self) -> bool: ...
-    @property
-    def remote(self) -> bool: ...
-    @property
-    def channels(self) -> list[int] | None: ...
+    def channels(self) -> list[int] | None:
+        """The remote control's pulse widths [µs]; None if it reports none."""
+        return None
 
 
 _MOST_CHANNELS: Final = 18
@@ -149,10 +202,6 @@ def _home(a: AutopilotState) -> Message | None:
     return m.MAVLink_home_position_message(*geodetic(a.home), *axes, [1, 0, 0, 0], 0, 0, 0)
 
 
-def _origin(a: AutopilotState) -> Message | None:
-    return m.MAVLink_gps_global_origin_message(*geodetic((0.0, 0.0, 0.0))) if a.has_origin else None
-
-
 def _imu(a: AutopilotState) -> Message:
     rates, force = flip(*a.report.believed.angular_velocity_rad_s), flip(*a.report.believed.acceleration_m_s2)
     return m.MAVLink_highres_imu_message(a.boot_ms * 1000, *force, *rates, 0.2, 0.0, 0.4, 955.0, 0.0, 488.0, 20.0, 63)
@@ -177,14 +226,6 @@ def _altitude(a: AutopilotState) -> Message:
     return m.MAVLink_altitude_message(a.boot_ms * 1000, up, ORIGIN.altitude_m + up, up, relative, up, math.nan)
 
 
-def _time(a: AutopilotState) -> Message:
-    return m.MAVLink_system_time_message(0, a.boot_ms)
-
-
-def _current_mode(a: AutopilotState) -> Message:
-    return m.MAVLink_current_mode_message(0, a.custom_mode, a.custom_mode)
-
-
 def _channels(a: AutopilotState) -> Message | None:
     widths = a.channels
     if widths is None:
@@ -196,10 +237,6 @@ def _channels(a: AutopilotState) -> Message | None:
 def _mission(a: AutopilotState) -> Message | None:
     mission = getattr(a, "mission", None)  # ArduCopter only
     return None if mission is None else m.MAVLink_mission_current_message(mission.current)
-
-
-def _sync(a: AutopilotState) -> Message:
-    return m.MAVLink_timesync_message(0, a.boot_ns)
 
 
 MAKERS: Final[dict[int, Maker]] = {
@@ -215,14 +252,16 @@ MAKERS: Final[dict[int, Maker]] = {
     m.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf,
     m.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator,
     m.MAVLINK_MSG_ID_HOME_POSITION: _home,
-    m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
+    m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: lambda a: (
+        m.MAVLink_gps_global_origin_message(*geodetic((0.0, 0.0, 0.0))) if a.has_origin else None
+    ),
     m.MAVLINK_MSG_ID_HIGHRES_IMU: _imu,
     m.MAVLINK_MSG_ID_RAW_IMU: _raw_imu,
     m.MAVLINK_MSG_ID_VFR_HUD: _hud,
     m.MAVLINK_MSG_ID_ALTITUDE: _altitude,
-    m.MAVLINK_MSG_ID_SYSTEM_TIME: _time,
-    m.MAVLINK_MSG_ID_CURRENT_MODE: _current_mode,
+    m.MAVLINK_MSG_ID_SYSTEM_TIME: lambda a: m.MAVLink_system_time_message(0, a.boot_ms),
+    m.MAVLINK_MSG_ID_CURRENT_MODE: lambda a: m.MAVLink_current_mode_message(0, a.custom_mode, a.custom_mode),
     m.MAVLINK_MSG_ID_RC_CHANNELS: _channels,
     m.MAVLINK_MSG_ID_MISSION_CURRENT: _mission,
-    m.MAVLINK_MSG_ID_TIMESYNC: _sync,
+    m.MAVLINK_MSG_ID_TIMESYNC: lambda a: m.MAVLink_timesync_message(0, a.boot_ns),
 }

@@ -76,10 +76,8 @@ class WorldAxes:
     """Moves positions in messages between the world's axes and the autopilot's, which are parallel.
 
     Needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while it uses
-    GPS, so several vehicles would each have their own.
-
-    Args:
-        begin: Origin of the world's axes: latitude and longitude [°] and altitude [m]; None for the autopilot's own.
+    GPS, so several vehicles would each have their own. ``begin`` is the world's origin: latitude and longitude [°] and
+    altitude [m]; None for the autopilot's own.
     """
 
     def __init__(self, begin: tuple[float, float, float] | None) -> None:

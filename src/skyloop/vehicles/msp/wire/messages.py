@@ -52,6 +52,20 @@ class Function(IntEnum):
     INAV_ANALOG = 0x2002
 
 
+# Layouts of payloads, or of those parts of them that every version has.
+_STATUS: Final = struct.Struct("<HHHIBHBB")
+_INAV_STATUS: Final = struct.Struct("<HHHHBI")
+_ATTITUDE: Final = struct.Struct("<hhh")
+_ALTITUDE: Final = struct.Struct("<ih")
+_BATTERY: Final = struct.Struct("<BHBHhB")
+_ANALOG: Final = struct.Struct("<BHHh")
+_INAV_ANALOG: Final = struct.Struct("<BHhIIIIB")
+_GPS: Final = struct.Struct("<BBiihHH")
+_IMU: Final = struct.Struct("<9h")
+_FAILSAFE: Final = struct.Struct("<BBHBHB")
+_RX: Final = struct.Struct("<BHHHBHH")
+
+
 def _unpack(form: struct.Struct, payload: bytes, what: str) -> tuple[int, ...]:
     if len(payload) < form.size:
         raise DecodeError(f"{what} of {len(payload)} bytes: at least {form.size} expected")
@@ -168,10 +182,6 @@ class Status:
         return made + struct.pack("<BIBHB", self.count, self.flags or 0, 0, 0, 4)
 
 
-_STATUS: Final = struct.Struct("<HHHIBHBB")
-_INAV_STATUS: Final = struct.Struct("<HHHHBI")
-
-
 @dataclass(frozen=True, slots=True)
 class Attitude:
     """Roll (positive right side down), pitch (positive nose down) and heading (clockwise from north) [degrees]."""
@@ -187,11 +197,7 @@ class Attitude:
         return cls(roll / 10, pitch / 10, float(heading))
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _ATTITUDE.pack(round(self.roll_deg * 10), round(self.pitch_deg * 10), round(self.heading_deg) % 360)
-
-
-_ATTITUDE: Final = struct.Struct("<hhh")
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +214,7 @@ class Altitude:
         return cls(height / 100, climb / 100)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _ALTITUDE.pack(round(self.height_m * 100), in_16_bits(self.climb_m_s * 100))
-
-
-_ALTITUDE: Final = struct.Struct("<ih")
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,11 +258,6 @@ class Battery:
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
 
-_BATTERY: Final = struct.Struct("<BHBHhB")
-_ANALOG: Final = struct.Struct("<BHHh")
-_INAV_ANALOG: Final = struct.Struct("<BHhIIIIB")
-
-
 @dataclass(frozen=True, slots=True)
 class CellVoltages:
     """Voltages of an empty and a full cell [V]."""
@@ -294,13 +291,9 @@ class Gps:
         return cls(bool(fix), satellites, latitude / 1e7, longitude / 1e7, altitude, speed / 100, course / 10)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         place = round(self.latitude_deg * 1e7), round(self.longitude_deg * 1e7), round(self.altitude_m)
         speed, course = round(self.speed_m_s * 100), round(self.course_deg * 10) % 3600
         return _GPS.pack(int(self.fix) * 2, self.satellites, *place, speed, course)
-
-
-_GPS: Final = struct.Struct("<BBiihHH")
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,11 +311,7 @@ class Imu:
         return cls((a, b, c), (d, e, f), (g, h, i))
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _IMU.pack(*self.acceleration, *self.gyro_deg_s, *self.magnetic)
-
-
-_IMU: Final = struct.Struct("<9h")
 
 
 # Sticks --------------------------------------------------------------------------------------------------------------
@@ -402,12 +391,8 @@ class FailsafeConfig:
         return cls(delay / 10, float(landing), throttle, low / 10, procedure)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         delay, low = round(self.delay_s * 10), round(self.low_throttle_s * 10)
         return _FAILSAFE.pack(delay, round(self.landing_s), self.throttle_us, 0, low, self.procedure)
-
-
-_FAILSAFE: Final = struct.Struct("<BBHBHB")
 
 
 class OnLoss(IntEnum):
@@ -445,11 +430,8 @@ class RxConfig:
         return cls(low, middle, high, least, most)
 
     def encode(self) -> bytes:
-        """Return the payload."""
         return _RX.pack(0, self.high_us, self.middle_us, self.low_us, 0, self.least_us, self.most_us)
 
-
-_RX: Final = struct.Struct("<BHHHBHH")
 
 RX_MSP: Final = 1 << 14  #: bit in Betaflight's features: sticks are received over MSP
 USUAL_MAP: Final = (0, 1, 3, 2)  #: positions of roll, pitch, yaw and throttle in ``SET_RAW_RC`` (AETR)

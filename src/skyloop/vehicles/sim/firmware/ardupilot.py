@@ -36,9 +36,8 @@ from skyloop.errors import DecodeError
 from skyloop.files import wait_readable
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, Readings
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
-from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, find_program
+from skyloop.vehicles.sim.firmware.program import Commands, CoupledFirmware, FirmwareEvent, Launch, find_program
 
 MAGIC_16: Final = 18458
 MAGIC_32: Final = 29569

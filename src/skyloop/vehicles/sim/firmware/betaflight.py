@@ -47,10 +47,16 @@ from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
-from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
+from skyloop.vehicles.sim.firmware.program import (
+    Commands,
+    CoupledFirmware,
+    FirmwareEvent,
+    Launch,
+    StartedInVainError,
+    find_program,
+)
 
 MOTORS_PORT: Final = 9002
 STATE_PORT: Final = 9003
@@ -265,9 +271,7 @@ class Betaflight(CoupledFirmware):
     def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
         """Return :func:`connected`, allowing more time after each failure.
 
-        Raises:
-            StartedInVainError: The process does not reply.
-            OSError: The process has ended.
+        Raises StartedInVainError if the process does not reply, and OSError if it has ended.
         """
         try:
             link = connected(self._msp_port, words, answer, self._patience_s)
@@ -335,10 +339,8 @@ class Betaflight(CoupledFirmware):
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
     """Connect to a serial port that opens soon; return once ``words`` get a reply that contains ``answer``.
 
-    Data sent before the port works is lost or ends the connection, so the attempt is repeated.
-
-    Raises:
-        OSError: There was no connection within ``within_s`` [s].
+    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if there
+    was no connection within ``within_s``.
     """
     end_s = time.monotonic() + within_s
     while True:

@@ -68,16 +68,10 @@ def reserve_instance(
     ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
     runs: Callable[[int], bool] = lambda _: False,
 ) -> int:
-    """Return the first free instance number and reserve it within this process.
+    """Return the first of ``most`` instance numbers whose ports are free, and reserve it within this process.
 
-    Args:
-        firmware: The firmware's name.
-        most: Maximum number of instances on a computer that its ports allow.
-        ports: Returns an instance's ports.
-        runs: Returns whether an instance is running, even if it has not opened its ports yet.
-
-    Raises:
-        UsageError: No instance number is free.
+    ``runs`` says whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError` if
+    no number is free.
     """
     with _lock:
         for instance in range(most):
@@ -106,8 +100,7 @@ _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 class Apart:
     """The parent's side of the connection to a firmware in a separate network.
 
-    Attributes:
-        port: TCP port on this computer that is forwarded to the firmware's TCP port.
+    ``port`` is the TCP port on this computer that is forwarded to the firmware's TCP port.
     """
 
     def __init__(self, udp_port: int, tcp_port: int) -> None:
@@ -149,8 +142,7 @@ class Apart:
 class Relay:
     """The keeper's side. Create it while there is only one thread, because this process leaves the computer's network.
 
-    Raises:
-        OSError: Leaving the network is not allowed.
+    Raises OSError if that is not allowed.
     """
 
     def __init__(self, option: str) -> None:

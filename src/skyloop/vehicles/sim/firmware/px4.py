@@ -23,9 +23,9 @@ from skyloop.messages.geometry import in_16_bits
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, GpsFix, Readings, geodetic
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
-from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
+from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
-from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, find_program
+from skyloop.vehicles.sim.firmware.program import Commands, CoupledFirmware, FirmwareEvent, Launch, find_program
 
 VARIABLE: Final = "SKYLOOP_PX4"
 WHERE: Final = (
@@ -76,8 +76,6 @@ class Px4(CoupledFirmware):
         folder: Path | None = None,
         instruments: InstrumentParameters = InstrumentParameters(),  # noqa: B008  immutable
     ) -> None:
-        from skyloop.vehicles.mavlink.wire.codec import Codec
-
         super().__init__(on_event, folder=folder)
         self._gps_delay_ms = round(instruments.gps_delay_s * 1000.0)
         self._codec = Codec(_SYSTEM, _COMPONENT)
@@ -135,7 +133,7 @@ class Px4(CoupledFirmware):
 
     def _begin(self) -> None:
         self._hang_up()
-        self._codec = type(self._codec)(_SYSTEM, _COMPONENT)
+        self._codec = Codec(_SYSTEM, _COMPONENT)
         self._backlog, self._step, self._sent, self._fix = b"", 0, 0, None
         self._own_us, self._wanted_us = STEP_US, 0
         self._inertial.clear()
@@ -235,8 +233,6 @@ class Px4(CoupledFirmware):
         self._backlog = self._backlog[sent:]
 
     def _sensor(self, readings: Readings, inertial: list[float]) -> Any:
-        from skyloop.vehicles.mavlink.wire.codec import dialect
-
         gyro, acceleration = flip(*inertial[:3]), flip(*inertial[3:])
         return dialect.MAVLink_hil_sensor_message(
             self._own_us,
@@ -251,8 +247,6 @@ class Px4(CoupledFirmware):
         )
 
     def _gps(self, fix: GpsFix) -> Any:
-        from skyloop.vehicles.mavlink.wire.codec import dialect
-
         east, north, up = fix.velocity_m_s
         speed = math.hypot(east, north)
         course = (
@@ -275,8 +269,6 @@ class Px4(CoupledFirmware):
         )
 
     def _truth(self, readings: Readings) -> Any:
-        from skyloop.vehicles.mavlink.wire.codec import dialect
-
         latitude, longitude, altitude = geodetic(readings.position_m)
         north, east, down = swap(*readings.velocity_m_s)
         speed_cm_s = min(65535, round(math.hypot(north, east, down) * 100.0))
@@ -294,8 +286,6 @@ class Px4(CoupledFirmware):
         )
 
     def _range(self, range_m: float) -> Any:
-        from skyloop.vehicles.mavlink.wire.codec import dialect
-
         return dialect.MAVLink_distance_sensor_message(
             self._own_us // 1000 & 0xFFFFFFFF, 5, 1000, round(range_m * 100.0), 0, 0, _DOWN, 0
         )

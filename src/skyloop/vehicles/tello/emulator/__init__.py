@@ -31,8 +31,14 @@ from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import Limits, VehicleParameters
-from skyloop.vehicles.emulation.datagrams import Address, DatagramPort
-from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.vehicles.emulation.emulator import (
+    NO_FAULTS,
+    Address,
+    DatagramPort,
+    Emulator,
+    RunningEmulator,
+    checked_delay,
+)
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import Encoder, Format, OneCamera, Piece, VideoEncoding, require_encoder
 from skyloop.vehicles.tello.emulator.logic import TelloLogic

@@ -9,17 +9,17 @@ users. When exactly real firmware sends them has not been verified.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from skyloop.clock import Clock, nanoseconds
-from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, Velocity
+from skyloop.messages import AnyAction, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
+from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
-from skyloop.vehicles.emulation.datagrams import Address
+from skyloop.vehicles.emulation.emulator import Address
 from skyloop.vehicles.emulation.flight import Vehicle
 from skyloop.vehicles.tello.emulator import telemetry
-from skyloop.vehicles.tello.emulator.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
 from skyloop.vehicles.tello.emulator.telemetry import Sighting, seen
 from skyloop.vehicles.tello.wire import (
     ENTER,
@@ -33,6 +33,109 @@ from skyloop.vehicles.tello.wire import (
     Sdk,
     decoded,
 )
+
+# Commands that take time and are answered when they end; driven by reports -------------------------------------------
+
+OK: Final = "ok"
+SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
+RISES_WITHIN_S: Final = 0.5  #: if it has not risen within this simulated time, take-off was refused for a low battery
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although it hovered long before
+FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
+TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
+PATIENCE_S: Final = 30.0  #: a command that takes longer than this fails
+_NEAR_M: Final = 0.06  # a move ends within this distance …
+_SLOW_M_S: Final = 0.12  # … and below this speed
+_NEAR_RAD: Final = 0.03  # a turn ends within this angle
+_FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
+
+#: The vehicle's next command, and the reply if the command that takes time is over.
+Step = tuple[AnyAction | None, str | None]
+
+
+class Rising:
+    """``takeoff``."""
+
+    def __init__(self, report: Report) -> None:
+        self._begun_s = report.truth.time_s
+        self._commanded_s: float | None = None
+
+    def step(self, report: Report) -> Step:
+        now_s, state = report.truth.time_s, report.truth.state
+        elapsed_s = now_s - self._begun_s
+        if self._commanded_s is None:
+            if elapsed_s < SPIN_UP_S:
+                return None, None
+            self._commanded_s = now_s
+            return Takeoff(), None
+        if state in (FlightState.LANDED, FlightState.EMERGENCY):
+            # Measured from the command, because this step may run late on a busy machine.
+            return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
+        return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
+
+
+class Landing:
+    """``land``, and the Tello's automatic landing if it receives no commands."""
+
+    def step(self, report: Report) -> Step:
+        if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
+            return None, OK
+        return (None if report.truth.state is FlightState.LANDING else Land()), None
+
+
+class Flipping:
+    """``flip``; only its duration is simulated."""
+
+    def __init__(self, report: Report) -> None:
+        self._until_s = report.truth.time_s + FLIP_S
+
+    def step(self, report: Report) -> Step:
+        return None, OK if report.truth.time_s >= self._until_s else None
+
+
+class Turning:
+    """``cw`` and ``ccw``: an angle, positive counter-clockwise, maybe several turns."""
+
+    def __init__(self, report: Report, by_rad: float) -> None:
+        self._left_rad = by_rad
+        self._yaw_rad = report.truth.yaw_rad
+
+    def step(self, report: Report) -> Step:
+        self._left_rad -= wrap_angle(report.truth.yaw_rad - self._yaw_rad)
+        self._yaw_rad = report.truth.yaw_rad
+        if abs(self._left_rad) < _NEAR_RAD:
+            return Hover(), OK
+        return Velocity(yaw_rate=clamped(2.5 * self._left_rad, TURN_RAD_S)), None
+
+
+class Going:
+    """Moves, ``go`` and ``curve``, by waypoints in world axes [m]."""
+
+    def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
+        self._places = list(places)
+        self._speed_m_s = speed_m_s
+        self._until_s = report.truth.time_s + PATIENCE_S
+
+    def step(self, report: Report) -> Step:
+        truth = report.truth
+        if truth.time_s > self._until_s:
+            return Hover(), "error"
+        offset = [goal - here for goal, here in zip(self._places[0], truth.position_m, strict=True)]
+        distance_m = math.hypot(*offset)
+        last = len(self._places) == 1
+        if distance_m < (_NEAR_M if last else 0.15) and (not last or math.hypot(*truth.velocity_m_s) < _SLOW_M_S):
+            if last:
+                return Hover(), OK
+            del self._places[0]
+            return None, None
+        share = min(self._speed_m_s, 1.6 * distance_m) / max(distance_m, 1e-6)
+        east, north, up = (part * share for part in offset)
+        return Velocity(*turned(east, north, -truth.yaw_rad), up), None
+
+
+Job = Rising | Landing | Flipping | Turning | Going
+
+
+# The logic -----------------------------------------------------------------------------------------------------------
 
 OUT_OF_RANGE: Final = "out of range"
 Range = tuple[int, int]
@@ -91,7 +194,6 @@ def _refusal(sdk: Sdk) -> str:
 USUAL_SPEED_CM_S: Final = 50  #: speed until ``speed`` sets another one
 FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
 SIZES: Final = {"high": (960, 720), "low": (640, 480)}
-_FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SINCE: Final = {"stop": Sdk.V2_0, "mon": Sdk.V2_0, "moff": Sdk.V2_0, "sdk?": Sdk.V2_0, "sn?": Sdk.V2_0}
 _SDK_NUMBERS: Final = {Sdk.V2_0: "20", Sdk.V3_0: "30"}
 
