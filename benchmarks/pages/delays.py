@@ -58,7 +58,6 @@ def blocks(folder: Path) -> dict[str, str]:
         "comparison": tables.comparison_table(experiment).markdown(),
         "targets": tables.verdict_table([*judge_delays(experiment), *judge_load(crowd)]).markdown(),
         "load": load_tables.load_table(crowd).markdown(),
-        "processor": load_tables.cpu_table(crowd).markdown(),
         "loop": tables.loop_table(trips).markdown(),
     }
 
