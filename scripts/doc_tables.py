@@ -35,11 +35,6 @@ def fates() -> str:
     return table(("fate", "what ends an intent"), [(f"`{fate.value}`", words) for fate, words in ENDINGS.items()])
 
 
-def endings() -> str:
-    """Return the same as a sentence."""
-    return "; ".join(ENDINGS.values()) + "."
-
-
 def attempts() -> str:
     """Return the attempts of intruders, and where they succeeded."""
     from tests.promises.security.deeds import COLUMNS, DEEDS, works
@@ -56,7 +51,7 @@ def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
 
 PAGES: Final[Mapping[str, Mapping[str, Callable[[], str]]]] = {
     "proxy.md": {"parameters": parameters, "fates": fates},
-    "security.md": {"endings": endings, "attempts": attempts},
+    "security.md": {"attempts": attempts},
 }
 
 

@@ -51,7 +51,6 @@ def loss_blocks(folder: Path) -> dict[str, str]:
     return {
         "machine": machine(results.machine, results.seconds),
         "network": tables.network_table(results).markdown(),
-        "path": tables.path_table(results).markdown(),
         "swarm": tables.swarm_table(runs).markdown(),
     }
 
