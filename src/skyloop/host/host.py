@@ -43,9 +43,8 @@ Announce = Callable[[str], None]
 class Host:
     """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
 
-    Args:
-        announce: Called with a line of text for users when a vehicle joins, fails or leaves.
-        make: Creates the driver for an address; used for vehicles in this process.
+    ``announce``: called with a line of text for users when a vehicle joins, fails or leaves. ``make``: creates the
+    driver for an address; used for vehicles in this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
@@ -72,12 +71,7 @@ class Host:
     # Joining and leaving -----------------------------------------------------------------------------------------
 
     def add(self, settings: VehicleSettings) -> HostedVehicle:
-        """Serve another vehicle.
-
-        Raises:
-            NameTakenError: This host or another running proxy already has the name.
-            SkyloopError: The vehicle can't be served; it is then listed as failed.
-        """
+        """Serve another vehicle. If that is not possible, raise the error, and list the vehicle as failed."""
         network = network_of(settings)
         with self._lock:
             if self._closing:
@@ -133,20 +127,10 @@ class Host:
         return problems
 
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
-        """Land a vehicle, end its proxy and forget it.
+        """Land a vehicle, end its proxy and forget it; return its last status.
 
-        Args:
-            name: The vehicle.
-            land: Whether to land the vehicle even if it flies under a pilot's lease.
-            timeout_s: Time to wait for the landing [s].
-
-        Returns:
-            Its last status.
-
-        Raises:
-            UnknownNameError: There is no vehicle with this name.
-            RefusedError: The vehicle flies under a lease (code ``flown``) or has not landed in time (``flying``). In
-                either case it is not removed.
+        Raises :class:`RefusedError` and does not remove it if it flies under a lease (code ``flown``), unless it is to
+        ``land`` nevertheless, or has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -226,13 +210,10 @@ class Host:
         within_s: float = 0.0,
         hurry: Callable[[], bool] = lambda: False,
     ) -> None:
-        """End all flights and proxies immediately, and all threads that are not stuck. Idempotent.
+        """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
 
-        Args:
-            reason: The reason, shown to users.
-            within_s: Time limit for landings [s].
-            hurry: Polled several times a second; True ends the wait for landings. So does Ctrl-C if nothing else
-                handles it; it is raised at the end.
+        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
+        does Ctrl-C if nothing else handles it; it is raised at the end.
         """
         with self._lock:
             self._closing = True
@@ -316,12 +297,7 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle from the host's file.
-
-    Raises:
-        UnknownNameError: The file has no vehicle with this name.
-        UsageError: The vehicle is already running.
-    """
+    """Return the settings of a vehicle from the host's file that is not running."""
     settings = host.known.get(name)
     if settings is None:
         raise UnknownNameError("vehicle of this host's file", name, host.known)

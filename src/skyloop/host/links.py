@@ -26,10 +26,8 @@ _MOST_STALE: Final = 4  #: number of queue entries per link at which stale ones 
 class LinkThread:
     """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
-
-    Args:
-        links: The initial links, each with the vehicle it belongs to.
+    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split. ``links``:
+    the initial ones, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:

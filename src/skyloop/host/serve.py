@@ -57,19 +57,8 @@ def serve(
 
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
     …`` after all have been tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
-    ``land_within_s`` [s]; a second signal ends the wait.
-
-    Args:
-        fleet: The vehicles.
-        group: Group of users who may also add and remove vehicles.
-        land_within_s: Time limit for landings [s].
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced; None: no endpoint.
-
-    Raises:
-        UsageError: ``metrics`` is not an address, or listening on it failed.
-        MissingExtraError: The extra ``metrics`` is needed and not installed.
-        NameTakenError: A running host has the name.
-        LinkError: The directory of sockets is not safe.
+    ``land_within_s`` [s]; a second signal ends the wait. Members of ``group`` may also add and remove vehicles.
+    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -238,12 +227,7 @@ class ControlServer:
         self._ended = threading.Event()
 
     def start(self) -> None:
-        """Start listening.
-
-        Raises:
-            NameTakenError: A running host has the name.
-            LinkError: The directory of sockets is not safe.
-        """
+        """Start listening."""
         self._listener, self._inode = self._directory.listen(self._name)
         self._thread = threading.Thread(
             target=self._run, args=(self._listener,), name="skyloop-host-control", daemon=True
@@ -328,12 +312,7 @@ def running_hosts(group: str | None = None) -> list[str]:
 
 
 def chosen_host(name: str | None = None, group: str | None = None) -> str:
-    """Return the host with this name, or the only host that is running.
-
-    Raises:
-        UsageError: No host is running, or several are and no name is given.
-        UnknownNameError: No host with this name is running.
-    """
+    """Return the host with this name, or the only host that is running."""
     running = running_hosts(group)
     if name is not None:
         if name not in running:
@@ -347,12 +326,9 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Send a request to a host and return its answer.
+    """Send a request to a host and return its answer, or raise the host's error.
 
-    Raises:
-        UsageError, RefusedError: Nothing was done; the message says why.
-        LinkError: The host can't be reached, or ended in the meantime.
-        NoAnswerError: The host did not answer in time.
+    Otherwise raises :class:`LinkError` if the host can't be reached or ends meanwhile, and :class:`NoAnswerError`.
     """
     directory = find_directory(group, HOST)
     try:

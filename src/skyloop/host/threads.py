@@ -35,10 +35,7 @@ class Ticker:
     """Ticks proxies on one thread, from construction to :meth:`close`. A failed tick does not affect other proxies.
 
     Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
-
-    Args:
-        on_failing: Called for a proxy after :data:`MAX_FAILURES` failed ticks in succession.
-        proxies: The initial proxies.
+    ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in succession.
     """
 
     def __init__(self, on_failing: OnFailing, proxies: Iterable[Proxy] = ()) -> None:
@@ -239,12 +236,8 @@ class Watchdog:
     """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
     It counts its own checks rather than time, so that a loop on a suspended or overloaded machine is not considered
-    hung merely because time has passed.
-
-    Args:
-        loops: Returns the loops.
-        on_stall: Called with a loop and its stuck member, once for each call that does not return.
-        on_hang: Called with the same arguments if the call still has not returned.
+    hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for each call
+    that does not return, and ``on_hang`` if the call still has not returned.
     """
 
     def __init__(

@@ -70,28 +70,14 @@ __all__ = [
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
-    """Serve the metrics of this process's proxies.
-
-    Args:
-        proxies: Returns the current proxies; called on the endpoint's thread for each scrape.
-        where: ``[HOST:]PORT``; see :func:`serve`.
-
-    Raises:
-        UsageError: ``where`` is not an address, or listening on it failed.
-        MissingExtraError: The extra ``metrics`` is not installed.
-    """
+    """Serve the metrics of the current proxies, which ``proxies`` returns for each scrape; see :func:`serve`."""
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
 
 
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return a context for :func:`skyloop.proxy.serve.run` that serves the metrics of its proxies.
-
-    Args:
-        where: ``[HOST:]PORT``; see :func:`serve`.
-        announce: Called with a line of text that tells users where the metrics are.
-    """
+    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics, and announces where."""
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
         endpoint = serve_proxies(lambda: proxies, where)

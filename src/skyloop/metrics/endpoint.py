@@ -158,24 +158,15 @@ Source = Callable[[], Iterable[Reading]]
 def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: float = DEADLINE_S) -> Endpoint:
     """Serve metrics over HTTP until the endpoint is closed.
 
-    Args:
-        sources: Returns the sources. Like each source, it is called on the endpoint's threads for each scrape.
-        where: ``[HOST:]PORT``; the host defaults to 127.0.0.1, and port 0 picks a free one.
-        deadline_s: Maximum duration of a connection [s]; at most :data:`MAX_SCRAPES` are open at a time.
-
-    Raises:
-        UsageError: ``where`` is not an address, or can't be listened on.
-        MissingExtraError: The extra ``metrics`` is not installed.
+    ``sources`` and each source are called on the endpoint's threads for each scrape. ``where``: ``[HOST:]PORT``; the
+    host defaults to 127.0.0.1, and port 0 picks a free one. ``deadline_s``: maximum duration of a connection [s]; at
+    most :data:`MAX_SCRAPES` are open at a time.
     """
     return Endpoint(sources, parse_where(where), deadline_s)
 
 
 def parse_where(where: str) -> tuple[str, int]:
-    """Return host and port from ``[HOST:]PORT``; IPv6 addresses are in brackets.
-
-    Raises:
-        UsageError: The text has another form.
-    """
+    """Return host and port from ``[HOST:]PORT``; IPv6 addresses are in brackets."""
     host, colon, port = where.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) <= 65535) or (colon and not host):
         raise UsageError(f"{where!r:.80} is not an address for metrics: give a port, 0 to 65535, or HOST:PORT")

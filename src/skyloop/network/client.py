@@ -44,19 +44,10 @@ _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return a dialer for a proxy on the network.
+    """Return a dialer for a proxy on the network, which takes up to ``find_s`` [s] to find it.
 
     The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
     proxy does not admit the application.
-
-    Args:
-        name: The proxy's name.
-        settings: How to join the network; by default by multicast, without keys.
-        find_s: Time allowed to find the proxy in each call of the dialer [s].
-
-    Raises:
-        UsageError: The name is invalid, or the keys are not those of an application.
-        MissingExtraError: The extra ``network`` is not installed.
     """
     check_name(name)
     load()
@@ -115,17 +106,9 @@ _WAKE: Final[_Item] = (None, b"", 0)
 class FabricClient(TransportClient):
     """The application's end, created by the dialer from :func:`dial`.
 
-    Args:
-        session: The Zenoh session; released when the connection ends, but not if the constructor raises.
-        name: The proxy's name.
-        handler: Called on the receiving thread.
-        find_s: Time allowed to find the proxy [s].
-        list_s: Additional time for linked nodes to list the proxies that they know [s].
-        known: The proxy's description of itself, if received earlier.
-
-    Raises:
-        UnknownNameError: No proxy with this name can be reached.
-        LinkError: The proxy does not admit this application, or does not answer (:class:`NoAnswerError`).
+    It releases its session when the connection ends, but not if the constructor raises: :class:`UnknownNameError` if
+    there is no such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]; :class:`LinkError` if
+    it does not admit this application; :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
     """
 
     def __init__(
@@ -175,10 +158,7 @@ class FabricClient(TransportClient):
         self._thread.start()
 
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
-        """Find the proxy and join it.
-
-        Raises: LinkError: The proxy does not admit us. UnknownNameError: There is no such proxy.
-        """
+        """Find the proxy and join it."""
         session, name = self._session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone, known)
         self._held.append(watch.declare())

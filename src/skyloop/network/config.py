@@ -65,9 +65,6 @@ class FabricSettings:
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
     (port 7447). Each means both TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC
     with keys. An address may also be a full Zenoh endpoint such as ``tcp/10.0.0.5:7447``, which is used unchanged.
-
-    Raises:
-        UsageError: The identity is invalid or has no certificate and key, or the lease is out of range.
     """
 
     listen: tuple[str, ...] = ()
@@ -84,11 +81,7 @@ class FabricSettings:
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
-        """Return these settings with the newest roster in the key folder, for use by a new session.
-
-        Raises:
-            LinkError: That roster revokes the keys in use.
-        """
+        """Return these settings with the newest roster in the folder; :class:`LinkError` if it revokes our keys."""
         if self.ring is None:
             return self
         self.ring.refresh()
@@ -143,17 +136,9 @@ NetworkChoice = bool | str | FabricSettings | None
 
 
 def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return the network settings, or None to stay on this host.
+    """Return the network settings, or None to stay on this host; by default, the environment's.
 
-    Log a warning if the key expires within a week.
-
-    Args:
-        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``. If that is not set, nothing
-            leaves this host.
-        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is invalid.
+    Log a warning if the key expires within a week. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     found = _choose(network, keys)
     if found is not None and found.ring is not None:
@@ -187,15 +172,8 @@ def serving(
 ) -> FabricSettings:
     """Return the network settings for a proxy, a host or a router.
 
-    Args:
-        network: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
-        listen: Addresses to listen on.
-        connect: Further addresses to connect to.
-        multicast: Whether multicast discovery is used if ``network`` includes it.
-        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address or the folder is invalid, or no address is given.
+    ``network``: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
+    ``multicast=False`` forbids it nevertheless. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -213,11 +191,7 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address or the folder is invalid.
-    """
+    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
     endpoints_of((*listen, *connect), found)  # reports invalid addresses before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
@@ -234,11 +208,7 @@ def _lease_s() -> float:
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """Return these settings with the identity in the given folder.
-
-    Raises:
-        UsageError: The folder is invalid, or an address can't be used with keys.
-    """
+    """Return these settings with the identity in the given folder."""
     from skyloop.network.keys import load  # imported only if there are keys: needs cryptography
 
     found = secured(plain, load(folder))
@@ -273,11 +243,7 @@ _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration by section; ``listen`` replaces the endpoints in the settings.
-
-    Raises:
-        UsageError: An address is invalid.
-    """
+    """Return Zenoh's configuration by section; ``listen`` replaces the endpoints in the settings."""
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
@@ -326,11 +292,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """Convert addresses (``HOST:PORT``, ``HOST`` or full endpoints) to Zenoh's: QUIC with keys, otherwise TCP and UDP.
-
-    Raises:
-        UsageError: An address is invalid, or unencrypted although keys are used.
-    """
+    """Convert addresses (``HOST:PORT``, ``HOST``, full endpoints) to Zenoh's: QUIC with keys, otherwise TCP and UDP."""
     found: list[str] = []
     for address in addresses:
         if "/" in address:
@@ -354,13 +316,7 @@ def to_json(sections: dict[str, Any]) -> str:
 
 
 def listening(settings: FabricSettings) -> list[str]:
-    """Return the addresses to listen on, with a free port in place of port 0.
-
-    If the settings have no addresses, listen on a free port on all interfaces.
-
-    Raises:
-        LinkError: No port is free.
-    """
+    """Return the addresses to listen on, with free ports in place of port 0; by default one on all interfaces."""
     addresses = settings.listen or (f"{all_interfaces()}:0",)
     return [
         f"{address.removesuffix(':0')}:{free_port(_host(address))}"
@@ -371,11 +327,7 @@ def listening(settings: FabricSettings) -> list[str]:
 
 
 def free_port(host: str) -> int:
-    """Return a port that is currently free for both TCP and UDP.
-
-    Raises:
-        LinkError: No port is free, or this host does not have the address.
-    """
+    """Return a port that is currently free for both TCP and UDP."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         for _ in range(50):
@@ -426,11 +378,7 @@ def _tls(settings: FabricSettings) -> dict[str, Any]:
 
 
 def _with_port(address: str) -> str:
-    """Return an address as HOST:PORT.
-
-    Raises:
-        UsageError: The text is not an address.
-    """
+    """Return an address as HOST:PORT."""
     host, colon, port = address.rpartition(":")
     if address.startswith("[") and address.endswith("]"):
         return f"{address}:{DEFAULT_PORT}"

@@ -91,15 +91,9 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet a topic has been acknowledged.
+        """Record up to which packet of a topic, or (if empty) of those to this application only, it has acknowledged.
 
-        Args:
-            topic: The topic; empty for packets sent to this application only.
-            number: The last acknowledged packet.
-            now_s: The monotonic clock [s].
-
-        Returns:
-            Whether further packets sent to this application only may be due.
+        Returns whether further packets sent to this application only may be due.
         """
         with self.lock:
             if not topic:
@@ -134,11 +128,7 @@ class ServerConnection:
             self._taken = max(self._taken, number)
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
-        """Return the packets to send now.
-
-        Returns:
-            The packets with their numbers (0: the transport's own), and whether more may become due later.
-        """
+        """Return the packets to send now (number 0: the transport's own), and whether more may become due later."""
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
@@ -154,12 +144,7 @@ Put = Callable[[ServerConnection, bytes, int], object]
 
 
 class Sender:
-    """Sends the connections' packets and resends unacknowledged ones. :meth:`wake` may be called on any thread.
-
-    Args:
-        put: Sends one packet; called on the sender's thread.
-        name: The proxy's name, used in the thread's name.
-    """
+    """Sends the connections' packets by ``put`` in its thread, and resends unacknowledged ones."""
 
     def __init__(self, put: Put, name: str) -> None:
         self._put = put
@@ -174,7 +159,7 @@ class Sender:
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Schedule the sending of a connection's due packets."""
+        """Schedule the sending of a connection's due packets. Any thread."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()

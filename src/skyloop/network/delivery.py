@@ -55,15 +55,9 @@ class Outgoing:
         self._headway_s = 0.0  # when the other end last acknowledged a packet, or when an idle path got its first one
 
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
-        """Keep another packet until it is acknowledged.
+        """Keep another packet, sent by the key ``way``, until it is acknowledged; return False if there is no room.
 
-        Args:
-            packet: The packet.
-            way: The key that the sender sends it by.
-            own: Whether it is one of the transport's own small packets, for which extra room is reserved.
-
-        Returns:
-            False if there is no room for it.
+        ``own``: it is one of the transport's own small packets, for which extra room is reserved.
         """
         if own:
             full = len(self._kept) >= 2 * self._depth
@@ -144,11 +138,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when a subscriber acknowledges a topic's packets. Not thread-safe.
-
-    Args:
-        every_s: Also acknowledge the first packet after this time [s].
-    """
+    """Decides when a subscriber acknowledges a topic's packets, within ``every_s`` [s]. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0
@@ -237,17 +227,9 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet that the other end resends until it is acknowledged.
+        """Receive a packet that is resent until acknowledged; return the number up to which all were accepted.
 
-        Args:
-            number: The packet's number, from 1.
-            packet: The packet.
-            has_room: Whether there is room for another packet; if not, this one is ignored and will be resent.
-            control: Handles the transport's own packets.
-            deliver: Handles all others.
-
-        Returns:
-            The number up to which all packets were accepted, to be acknowledged.
+        Without room for another packet, it is ignored and will be resent.
         """
         with self._lock:
             if has_room():

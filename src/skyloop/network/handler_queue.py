@@ -59,11 +59,7 @@ class HandlerQueue(Generic[Item]):
         self._closed = False
 
     def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue a connection's item. At most ``at_most`` of its items may wait; urgent items go first. Any thread.
-
-        Returns:
-            False if the item was refused.
-        """
+        """Queue a connection's item, urgent ones first; refuse it if ``at_most`` are waiting. Any thread."""
         with self._changed:
             queue = self._urgent if urgent else self._others
             if at_most is not None and queue.count(of) >= at_most:

@@ -127,11 +127,7 @@ def downward(name: str) -> tuple[str, str, str]:
 
 
 def parse_sender(key: str) -> Sender:
-    """Return the application that a key belongs to.
-
-    Raises:
-        DecodeError: The key is not an application's.
-    """
+    """Return the application that a key belongs to."""
     parts = key.split("/")
     if len(parts) == 6 and WHO.fullmatch(parts[4]) and ID.fullmatch(parts[5]):
         return Sender(parts[3], parts[4], parts[5])
@@ -139,11 +135,7 @@ def parse_sender(key: str) -> Sender:
 
 
 def parse_alive(key: str) -> tuple[str, str]:
-    """Parse NAME and RUN from the key of a transport server's token.
-
-    Raises:
-        DecodeError: The key is not that of a transport server's token.
-    """
+    """Parse NAME and RUN from the key of a transport server's token."""
     parts = key.split("/")
     if len(parts) == 5 and parts[3] == "alive" and NAME.fullmatch(parts[2]) and ID.fullmatch(parts[4]):
         return parts[2], parts[4]
@@ -156,11 +148,7 @@ def parse_topic(key: str) -> str:
 
 
 def check_identity(who: str) -> None:
-    """Check that an identity is valid.
-
-    Raises:
-        UsageError: It can't be used as WHO.
-    """
+    """Check that an identity can be used as WHO."""
     if not WHO.fullmatch(who):
         raise UsageError(
             f"{who!r} cannot be an identity: 1 to 64 letters, digits, '_', '-' and '.', the first one a letter or digit"
@@ -197,8 +185,7 @@ def is_report(packet: bytes) -> bool:
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
     """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
 
-    Returns:
-        The reply's packet; None if the packet is not a request.
+    None if the packet is not a request.
     """
     try:
         sample = decode(packet)

@@ -37,19 +37,10 @@ Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
-    """The connections of one transport server.
+    """The connections of one transport server. Thread-safe, except for :meth:`check`.
 
-    Thread-safe, except for :meth:`check`, which must be called on the handler's thread.
-
-    Args:
-        name: The proxy's name.
-        run: The run of the proxy.
-        ring: The proxy's keys; None without keys.
-        topic_keys: The seal for published packets; None without keys.
-        publisher: The subscriptions.
-        sender: Sends packets to individual applications.
-        queue: The queue for the thread that calls the handler.
-        excused_s: Time to wait beyond :data:`STALLED_S` before disconnecting a silent application [s].
+    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: time to wait beyond :data:`STALLED_S` before
+    disconnecting a silent application [s].
     """
 
     def __init__(
@@ -112,11 +103,7 @@ class ConnectionRegistry:
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
-        """Return the connection that a key belongs to.
-
-        Raises:
-            DecodeError: No connection has this id and identity.
-        """
+        """Return the connection that a key belongs to; :class:`DecodeError` if none has this id and identity."""
         connection = self._connections.get(sender.id)
         if connection is None or connection.who != sender.who:
             raise DecodeError("it is not connected")
@@ -182,11 +169,7 @@ class ConnectionRegistry:
                 self._send_topic_key(connection, self._topic_keys.newest)
 
     def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
-        """Check the keys in a request.
-
-        Raises:
-            LinkError: The application has no key for this drone.
-        """
+        """Check the keys in a request."""
         if self._ring is not None and sender.who in self._ring.shut_out:
             raise LinkError(_SHUT_OUT)
         newest = self._topic_keys.newest if self._topic_keys else None
@@ -316,11 +299,7 @@ class ConnectionRegistry:
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
         """Disconnect an application and drop its unhandled packets. Any thread.
 
-        Args:
-            connection: The application's connection.
-            reason: The reason, which is sent to the application.
-            forget: Whether to remove the connection at once; otherwise it is removed when the application answers or
-                its token disappears.
+        With ``forget=False``, the connection is removed when the application answers or its token disappears.
         """
         self._hang_up(connection, reason)
         connection.ended = True

@@ -41,16 +41,7 @@ class FabricServer(TransportServer):
     """A proxy's end, which applications find on the network by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a reachable proxy already has the name, and :class:`LinkError` if
-    joining the network fails.
-
-    Args:
-        name: The proxy's name.
-        settings: How to join the network; by default by multicast, without keys.
-        vehicle: The vehicle's address, which is sent to anyone who searches for the proxy.
-
-    Raises:
-        UsageError: The name is invalid, or the keys don't permit serving it.
-        MissingExtraError: The extra ``network`` is not installed.
+    joining the network fails. ``vehicle``: the vehicle's address, which is sent to anyone who searches for the proxy.
     """
 
     def __init__(self, name: str, settings: FabricSettings | None = None, *, vehicle: str = "") -> None:

@@ -34,12 +34,7 @@ _ATTEMPTS: Final = 5  # attempts to get a free port before another process takes
 
 
 class Session:
-    """A shared Zenoh session; give it back with :func:`release`.
-
-    Raises:
-        LinkError: Joining the network failed.
-        MissingExtraError: The extra ``network`` is not installed.
-    """
+    """A shared Zenoh session; give it back with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
@@ -121,13 +116,7 @@ class _Pool:
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
-        """Return a session with these settings, opening one if necessary.
-
-        Raises:
-            LinkError: Joining the network failed.
-            UsageError: An address is invalid.
-            MissingExtraError: The extra ``network`` is not installed.
-        """
+        """Return a session with these settings, opening one if necessary."""
         with self._changed:
             if self._over:
                 raise LinkError("the network can't be joined: this process is exiting")
@@ -221,11 +210,7 @@ atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:
-    """Import the package zenoh and return it.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-    """
+    """Import the package zenoh and return it; without it, raise :class:`MissingExtraError`."""
     try:
         import zenoh
     except ImportError as error:
@@ -241,10 +226,8 @@ def host_name() -> str:
 def renewed(session: Session) -> Session:
     """Replace a session that has no other users by one at the same addresses with the newest roster.
 
-    All its links are closed and re-established.
-
-    Raises:
-        LinkError: The keys were revoked, or an address does not become free again within :data:`REOPEN_S`.
+    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
+    not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)

@@ -27,13 +27,9 @@ _VIDEO: Final = video("")
 class Subscription:
     """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
 
-    Args:
-        topic: A topic with packets, or with a camera's frames in one form.
-        run: The proxy's run. Packets that others publish under its name are ignored.
-        opener: Opens the proxy's packets.
-        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number; these must be passed to
-            :meth:`deliver` in order.
-        reject: Called with the reason when a packet did not come from the proxy.
+    ``run``: the proxy's run; packets that others publish under its name are ignored. ``enqueue``: called with this
+    subscription, a packet (empty: a frame is due) and its number, which must be passed to :meth:`deliver` in order.
+    ``reject``: called with the reason when a packet did not come from the proxy.
     """
 
     def __init__(
@@ -72,11 +68,7 @@ class Subscription:
         self._ended = True
 
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
-        """Deliver the next item to the handler.
-
-        Returns:
-            The packet that acknowledges it to the proxy; empty if none is needed.
-        """
+        """Deliver the next item to the handler; return the packet that acknowledges it, empty if none is needed."""
         if packet:
             self._waiting -= 1
             handler.packet(packet)

@@ -232,13 +232,10 @@ def at_once(
     over: Callable[[K], bool] = lambda _: False,
     daemon: bool = False,
 ) -> None:
-    """End several flights at the same time, and wait for all.
+    """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
-    Args:
-        ends: The functions that end the flights, each run in its own thread; they must not raise.
-        tell: Called with the ones for which there is no thread, before they are run one after another.
-        over: Returns whether to stop waiting for one.
-        daemon: Whether the program may end before they do.
+    ``tell``: called with the ones for which there is no thread, before they are run one after another. ``over``:
+    returns whether to stop waiting for one. ``daemon``: whether the program may end before they do.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():

@@ -361,14 +361,7 @@ NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
 def check_name(name: str) -> None:
-    """Check the name of a proxy.
-
-    Args:
-        name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``, the first one a letter or digit.
-
-    Raises:
-        UsageError: The name is invalid.
-    """
+    """Raise :class:`UsageError` unless this can be the name of a proxy (:data:`NAME`)."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
@@ -377,27 +370,13 @@ def check_name(name: str) -> None:
 
 
 def check_packet(packet: bytes) -> None:
-    """Check the size of a packet.
-
-    Args:
-        packet: 1 to :data:`MAX_PACKET` bytes.
-
-    Raises:
-        UsageError: The packet is empty or too large.
-    """
+    """Raise :class:`UsageError` unless a packet has 1 to :data:`MAX_PACKET` bytes."""
     if not 0 < len(packet) <= MAX_PACKET:
         raise UsageError(f"a packet of {len(packet)} bytes cannot be sent; it must have 1 to {MAX_PACKET}")
 
 
 def check_topic(topic: str) -> None:
-    """Check the length of a topic's name.
-
-    Args:
-        topic: 1 to :data:`MAX_TOPIC` characters.
-
-    Raises:
-        UsageError: The name is empty or too long.
-    """
+    """Raise :class:`UsageError` unless a topic's name has 1 to :data:`MAX_TOPIC` characters."""
     if not 0 < len(topic) <= MAX_TOPIC:
         raise UsageError(f"the topic {topic[:100]!r} has {len(topic)} characters; it must have 1 to {MAX_TOPIC}")
 
@@ -408,15 +387,7 @@ def too_many_topics(topic: str) -> str:
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Check that pixels match their header.
-
-    Args:
-        header: The frame's header.
-        pixels: ``header.size`` bytes, dtype uint8, C-contiguous, in any shape.
-
-    Raises:
-        UsageError: The size, dtype or order differs.
-    """
+    """Raise :class:`UsageError` unless pixels match their header in size, dtype and order."""
     if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(

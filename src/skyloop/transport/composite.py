@@ -20,16 +20,10 @@ class _Member(NamedTuple):
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, and has its own numbers for their peers.
+    """One transport server that combines several, nearest first, and has its own numbers for their peers.
 
     The handler gets one call at a time, as the contract requires: an end that brings a command goes first, the others
     in order of arrival.
-
-    Args:
-        ends: The transport servers, nearest first; at least one.
-
-    Raises:
-        UsageError: ``ends`` is empty.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
@@ -41,13 +35,7 @@ class CompositeServer(TransportServer):
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start accepting connections at all ends, or at none.
-
-        If an end's ``start`` raises, the ends before it are stopped and the error is re-raised.
-
-        Args:
-            handler: Called by one end at a time, on that end's receiving threads.
-        """
+        """Start accepting connections at all ends or, if an end's ``start`` raises, at none."""
         started: list[TransportServer] = []
         try:
             for end in self._ends:
@@ -112,15 +100,7 @@ class CompositeServer(TransportServer):
         return ", ".join(end.address for end in self._ends)
 
     def enter(self, end: TransportServer, peer: Peer) -> Peer:
-        """Register an end's peer under a number of this server. The caller holds the lock.
-
-        Args:
-            end: The end that the application connected to.
-            peer: The application's peer at that end.
-
-        Returns:
-            The peer to pass to the handler.
-        """
+        """Give an end's peer a number of this server; return it as the handler knows it. The caller holds the lock."""
         self._last_id += 1
         ours = Peer(self._last_id, peer.address)
         self._members[ours.id] = _Member(end, peer)

@@ -56,12 +56,7 @@ _Item = tuple["MemoryClient", _What, str]  # the text describes a malformed requ
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop.
-
-    Args:
-        name: Name used in its address and for its threads.
-        faults: Faults to inject; none by default.
-    """
+    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -74,17 +69,7 @@ class MemoryServer(TransportServer):
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect to this server.
-
-        Args:
-            handler: Called on the client's own receiving thread.
-
-        Returns:
-            The connected transport client.
-
-        Raises:
-            LinkError: The server has not been started.
-        """
+        """Connect to this server, which must be running. The handler runs on the client's own receiving thread."""
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"{self.address} has no server: start the transport server first")
@@ -158,13 +143,7 @@ class MemoryServer(TransportServer):
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection. Idempotent.
-
-        Args:
-            client: The connection's client.
-            reason: The reason, for both ends' handlers.
-            muted: Whether to drop the client's undelivered packets.
-        """
+        """End a connection; ``muted``: drop the client's undelivered packets. Idempotent."""
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
                 return
@@ -263,11 +242,7 @@ class MemoryClient(TransportClient):
         return True
 
     def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
-        """Queue a frame from the server.
-
-        Returns:
-            False if it replaced a waiting frame, or if the connection has ended.
-        """
+        """Queue a frame from the server; return False if it replaced a waiting frame, or the connection has ended."""
         room = True
         with self._down_lock:
             if self._ended:

@@ -44,11 +44,7 @@ class Lane(IntEnum):
 
 
 class PacketBacklog:
-    """Holds the waiting packets of one connection. Not thread-safe.
-
-    Args:
-        most: Maximum number of waiting packets.
-    """
+    """Holds the waiting packets of one connection, at most ``most``. Not thread-safe."""
 
     __slots__ = ("_bytes", "_idle", "_last", "_most", "_number", "_set_point", "_waiting")
 
@@ -149,11 +145,7 @@ class PriorityLock:
         self.urgent = _Urgent(self)
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock and acquire it; the owner may acquire it again.
-
-        Args:
-            urgent: Whether to go before all non-urgent waiters.
-        """
+        """Wait for the lock and acquire it, if ``urgent`` before all others; the owner may acquire it again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me

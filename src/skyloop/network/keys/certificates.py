@@ -146,14 +146,9 @@ def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Autho
 def issue_page(
     authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Create a certificate for a cockpit's page.
+    """Create a certificate for a cockpit's page, reached by these IP addresses and host names, valid in UTC.
 
-    Args:
-        authority: The authority for pages, with its key.
-        names: IP addresses and host names by which browsers reach the page, at least one.
-        key: The page's key.
-        until: Expiry in UTC, but no later than that of the authority's certificate.
-        now: The current time in UTC.
+    It expires no later than that of the authority.
     """
     assert authority.key is not None
     issuer = authority.certificate
@@ -187,11 +182,7 @@ def may_certify(authority: Authority, name: str) -> bool:
 
 
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
-    """Decode a certificate read from a file.
-
-    Raises:
-        FileFormatError: The data are not a certificate.
-    """
+    """Decode a certificate read from a file."""
     try:
         return x509.load_pem_x509_certificate(content)
     except ValueError:
@@ -199,11 +190,7 @@ def read_certificate(content: bytes, path: Path) -> x509.Certificate:
 
 
 def read_der(content: bytes) -> x509.Certificate:
-    """Decode a certificate received over the network.
-
-    Raises:
-        DecodeError: The data are not a certificate in DER.
-    """
+    """Decode a certificate in DER received over the network."""
     try:
         return x509.load_der_x509_certificate(content)
     except ValueError as error:
@@ -233,11 +220,7 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 
 
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Decode a private key read from a file.
-
-    Raises:
-        FileFormatError: The data are not a private key on an elliptic curve.
-    """
+    """Decode a private key on an elliptic curve, read from a file."""
     try:
         key = serialization.load_pem_private_key(content, password=None)
     except (ValueError, TypeError):  # TypeError is raised for an encrypted key
@@ -248,12 +231,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's. Its key is None where nothing is issued.
-
-    Raises:
-        FileFormatError: The certificate is not an authority's.
-        UsageError: The key does not belong to the certificate.
-    """
+    """Check that a certificate is an authority's. Its key is None where nothing is issued."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:
@@ -266,11 +244,7 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
-    """Return the identity in a certificate.
-
-    Raises:
-        FileFormatError: It does not name a role and drones.
-    """
+    """Return the identity in a certificate."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         (urn,) = (uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_URN))
@@ -294,11 +268,7 @@ def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
 
 
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
-    """Check that an authority issued a certificate.
-
-    Raises:
-        UsageError: Another authority issued it.
-    """
+    """Check that an authority issued a certificate."""
     try:
         certificate.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature):
@@ -308,11 +278,7 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
-    """Check that a certificate is currently valid.
-
-    Raises:
-        UsageError: The certificate is not valid yet, or has expired.
-    """
+    """Check that a certificate is currently valid."""
     if now >= certificate.not_valid_after_utc:
         raise UsageError(f"{what} expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: issue a new one")
     if now < certificate.not_valid_before_utc:

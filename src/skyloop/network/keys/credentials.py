@@ -116,12 +116,7 @@ def encode_roster(roster: Roster, authority: Authority) -> bytes:
 
 
 def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
-    """Check the signature of a roster file, then decode it.
-
-    Raises:
-        FileFormatError: The file is not a roster, is damaged, or has an unknown format.
-        UsageError: The file was modified, or another authority signed it.
-    """
+    """Check the signature of a roster file, then decode it."""
     try:
         file = msgspec.json.decode(content, type=_File)
         signature = base64.b64decode(file.signature, validate=True)
@@ -182,32 +177,19 @@ class Credentials:
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return what has expired or will expire within a week: this key, the lab's authority, or both.
-
-        Returns:
-            A sentence for users about each, by subject.
-        """
+        """Return what expired or will within a week, this key or the lab's authority, and a sentence on it."""
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster if the folder has one, otherwise None.
-
-        Raises:
-            UsageError: The roster can't be read, or was not signed by this lab's authority.
-        """
+        """Return these credentials with a newer roster if the folder has one, otherwise None."""
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and verify all of it.
-
-    Raises:
-        UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` if a file is damaged or
-            of the wrong kind. The message says how to fix it.
-    """
+    """Read an identity's folder and verify all of it. Raises :class:`UsageError`, which says how to fix it."""
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
     _check_folder(path)
@@ -227,11 +209,7 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the public certificate and the roster from the folder of a lab or an identity.
-
-    Raises:
-        UsageError: The folder does not exist, or a file in it is missing or invalid.
-    """
+    """Read the public certificate and the roster from the folder of a lab or an identity."""
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
     authority = _read_authority(directory)

@@ -18,11 +18,7 @@ _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory that only its owner can enter, or check an existing one.
-
-    Raises:
-        UsageError: The directory can't be created, or is accessible to others.
-    """
+    """Create a directory that only its owner can enter, or check an existing one."""
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = path.stat().st_mode
@@ -33,11 +29,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file atomically. A private one is readable only by its owner, from the first byte on.
-
-    Raises:
-        UsageError: The file can't be written.
-    """
+    """Replace a file atomically. A private one is readable only by its owner, from the first byte on."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
@@ -52,20 +44,12 @@ def write(path: Path, content: bytes, *, private: bool = False) -> None:
 
 
 def read(path: Path, what: str) -> bytes:
-    """Read a file of at most :data:`MAX_BYTES`.
-
-    Raises:
-        UsageError: The file can't be read, or is too large.
-    """
+    """Read a file of at most :data:`MAX_BYTES`."""
     return read_bytes(path, what, MAX_BYTES)
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """Read a file that must not be accessible to others, because they might have copied the key.
-
-    Raises:
-        UsageError: The file can't be read, is too large, or is accessible to others.
-    """
+    """Read a file that must not be accessible to others, because they might have copied the key."""
     content = read(path, what)
     mode = path.stat().st_mode
     if mode & _OTHERS:
@@ -81,9 +65,6 @@ def locked(directory: Path) -> Iterator[None]:
     """Lock a directory against changes by other processes; wait while one of them holds the lock.
 
     The kernel releases the lock when the process ends.
-
-    Raises:
-        UnsupportedError: This platform does not support file locks.
     """
     try:
         import fcntl

@@ -51,31 +51,19 @@ class Identity:
         return self.role is KeyRole.PROXY and self.covers(drone)
 
     def require_proxy(self, drone: str) -> None:
-        """Check that this is a proxy that may serve a drone with this name.
-
-        Raises:
-            UsageError: That is not the case.
-        """
+        """Check that this is a proxy that may serve a drone with this name."""
         if self.role is not KeyRole.PROXY:
             raise UsageError(f"these are the keys of {self}: a proxy needs keys of --role proxy")
         if not self.covers(drone):
             raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
 
     def require_router(self) -> None:
-        """Check that this is a router.
-
-        Raises:
-            UsageError: That is not the case.
-        """
+        """Check that this is a router."""
         if self.role is not KeyRole.ROUTER:
             raise UsageError(f"these are the keys of {self}: a router needs keys of --role router")
 
     def require_application(self) -> None:
-        """Check that this is a pilot or an observer.
-
-        Raises:
-            UsageError: That is not the case.
-        """
+        """Check that this is a pilot or an observer."""
         if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
             raise UsageError(f"these are the keys of {self}: an application needs a pilot's or an observer's")
 
@@ -86,13 +74,8 @@ class Identity:
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
     """Create an identity from user input.
 
-    Args:
-        name: 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``; not ``anyone``.
-        role: A value of :class:`KeyRole`.
-        drones: Names of drones or patterns, separated by commas; ``*`` for a router.
-
-    Raises:
-        UsageError: One of the arguments is invalid.
+    The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and is not ``anyone``; ``role`` is a value
+    of :class:`KeyRole`; ``drones`` are names or patterns separated by commas, for a router ``*``.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -110,11 +93,7 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
 
 
 def parse_drones(text: str) -> tuple[str, ...]:
-    """Parse drone names or patterns separated by commas: ``alpha,bravo*``.
-
-    Raises:
-        UsageError: A pattern is invalid, or there are more than :data:`MAX_PATTERNS`.
-    """
+    """Parse drone names or patterns separated by commas: ``alpha,bravo*``."""
     patterns = tuple(dict.fromkeys(re.sub(r"\*+", "*", part.strip()) for part in text.split(",")))
     for pattern in patterns:
         if not _PATTERN.fullmatch(pattern) or not (_NAME.fullmatch(pattern) or "*" in pattern):

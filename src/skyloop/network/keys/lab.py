@@ -69,16 +69,7 @@ class Lab:
 
     @classmethod
     def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
-        """Create a new authority in a folder of its own.
-
-        Args:
-            directory: The folder, created if it does not exist.
-            days: Validity of the authority, 1 to 36500.
-            now: The current time in UTC; by default this machine's clock.
-
-        Raises:
-            UsageError: The folder already contains an authority or can't be used, or ``days`` is out of range.
-        """
+        """Create a new authority in a new folder, valid for 1 to 36500 days."""
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
         files.make_directory(directory)
@@ -95,11 +86,7 @@ class Lab:
 
     @classmethod
     def open(cls, directory: Path) -> Lab:
-        """Open the authority in a folder.
-
-        Raises:
-            UsageError: The folder contains no authority, or a file is damaged.
-        """
+        """Open the authority in a folder."""
         key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
         if not key_path.exists():
             raise UsageError(f"there is no authority in {directory}: make one with skyloop keys init")
@@ -122,16 +109,9 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create a new key and certificate for an identity, or renew them.
+        """Create a new key and certificate for an identity, or renew them, valid no longer than the authority.
 
-        Args:
-            identity: The holder.
-            days: Validity of the key, more than 0 and at most :data:`MAX_IDENTITY_DAYS`; limited by the authority's.
-            now: The current time in UTC; by default this machine's clock.
-
-        Raises:
-            UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
-                still valid, or a file can't be written.
+        A revoked name is refused until its lost key is no longer valid.
         """
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
@@ -159,10 +139,6 @@ class Lab:
         """Revoke an identity and delete the files in its folder here.
 
         The revocation takes effect wherever the new roster is installed.
-
-        Raises:
-            UnknownNameError: The roster has no such name.
-            UsageError: It is already revoked.
         """
         with files.locked(self.directory):
             roster = self.roster
@@ -215,15 +191,8 @@ def page_certificate(
 ) -> PageFiles:
     """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
 
-    Args:
-        directory: The folder, created if it does not exist.
-        own: This machine's addresses and names; those that the authority may not certify are left out.
-        wanted: Names given by the user.
-        now: The current time in UTC; by default this machine's clock.
-
-    Raises:
-        UsageError: A name in ``wanted`` may not be certified, no name remains, or a file can't be used.
-        MissingExtraError: The extra ``network`` is not installed.
+    ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
+    names given by the user, which it must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now
     files.make_directory(directory.parent)

@@ -71,15 +71,11 @@ class Airspace:
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
     ) -> Verdict:
-        """Judge a new or repeated request.
+        """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
 
-        Args:
-            action: The requested action, with finite numbers.
-            feedback: The newest sample; None if there is none yet.
-            now_ns: The current time, on the clock of ``feedback.captured_ns`` [ns].
-            new: Whether it is a new request. A permitted target stays permitted while nothing else is requested: if
-                drift puts an obstacle in the way, the steps avoid it; a lower ceiling lowers the target.
-            planned: Whether it is part of a route that was checked as a whole, and so may be lowered from the start.
+        ``new``: a permitted target stays permitted while nothing else is requested: if drift puts an obstacle in the
+        way, the steps avoid it; a lower ceiling lowers the target. ``planned``: it is part of a route that was checked
+        as a whole, and so may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -181,11 +177,7 @@ class Airspace:
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point that stays inside the box and outside the zones.
-
-        Returns:
-            The set-point (unchanged if the position is unknown), the limits that applied, and whether it is known.
-        """
+        """Return the nearest set-point between the walls, what limits it, and whether the position is known."""
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
         self.observe(feedback)

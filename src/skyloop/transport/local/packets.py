@@ -119,12 +119,7 @@ def slot(number: int, camera: int, capacity: int) -> bytes:
 
 
 def frame(number: int, header: bytes) -> bytes:
-    """Encode a :class:`Frame`.
-
-    Args:
-        number: The slot's number.
-        header: The whole packet of the :class:`FrameHeader`.
-    """
+    """Encode a :class:`Frame`; ``header``: the whole packet of its :class:`FrameHeader`."""
     return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
 
 
@@ -143,11 +138,7 @@ def _packet(kind: LocalKind, body: bytes) -> bytes:
 
 
 def parse(packet: bytes) -> Message:
-    """Decode one of the transport's own packets.
-
-    Raises:
-        DecodeError: The packet is of another kind, or damaged.
-    """
+    """Decode one of the transport's own packets."""
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")
     if packet[5:6] == FRAME:
@@ -176,11 +167,7 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello | Release | Slot | Retir
 
 
 def parse_frame(packet: bytes) -> Frame:
-    """Decode a frame's packet, header and slot in one step, because such packets are frequent.
-
-    Raises:
-        DecodeError: The packet is of another kind, or damaged.
-    """
+    """Decode a frame's packet, header and slot in one step, because such packets are frequent."""
     if len(packet) < _FRAME_PREFIX.size:
         raise DecodeError(f"{len(packet)} bytes are too few for the {_FRAME_PREFIX.size} before the header of a frame")
     signature, version, _, reserved, length, slot = _FRAME_PREFIX.unpack_from(packet)

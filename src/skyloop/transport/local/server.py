@@ -50,14 +50,8 @@ class LocalServer(TransportServer):
     """A proxy's end, which is found on this host by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
-    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature.
-
-    Args:
-        name: The proxy's name.
-        group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
-
-    Raises:
-        UsageError: The name or the group is invalid, or the socket's path would be too long.
+    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature. ``group``: users who
+    may also connect (``SKYLOOP_GROUP``).
     """
 
     def __init__(self, name: str, *, group: str | None = None) -> None:
@@ -318,11 +312,7 @@ class LocalServer(TransportServer):
         handler.peer_joined(connection.peer)
 
     def _control(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> bool:
-        """Handle one of the transport's own packets.
-
-        Returns:
-            False if it makes no sense; the handler gets it, like any other garbage.
-        """
+        """Handle one of the transport's own packets; return False for garbage, which the handler gets."""
         try:
             message = packets.parse(packet)
         except DecodeError:
@@ -379,12 +369,7 @@ class LocalServer(TransportServer):
 
 
 def _problem(topic: str, subscribed: int) -> str:
-    """Return why an application can't subscribe to an existing topic; empty if it can.
-
-    Args:
-        topic: The topic.
-        subscribed: Number of topics that the application has subscribed to.
-    """
+    """Return why an application with that many topics can't subscribe to another existing one; empty if it can."""
     if topic.startswith(_VIDEO) and "?" in topic:
         return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"
     return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""

@@ -30,9 +30,6 @@ class Socket(socket.socket):
 
     Both ends *shut down* a connection and drop their references, but never close it, so that a descriptor's number
     can't be reused while a thread is sending on it.
-
-    Args:
-        fileno: An open descriptor to take over; None for a new socket.
     """
 
     def __init__(self, fileno: int | None = None) -> None:
@@ -89,15 +86,7 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the connecting process has access.
-
-    Args:
-        sock: The accepted connection.
-        gid: The group that has access; None if there is none.
-
-    Returns:
-        True for a process of this process's user, of the superuser, or of a member of the group.
-    """
+    """Return whether the connecting process has access: as our own user, the superuser, or a member of the group."""
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
@@ -112,25 +101,16 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long the kernel blocks in a call, which then fails with ``EAGAIN``.
+    """Limit how long the kernel blocks in a call [s], which then fails with ``EAGAIN``; 0: no limit.
 
-    Args:
-        sock: The socket.
-        option: ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``.
-        seconds: The limit [s]; 0 for none.
+    ``option``: ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``.
     """
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
 
 class ServerConnection:
-    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread.
-
-    Args:
-        sock: The accepted socket.
-        peer: The peer, as the handler knows it.
-        who: The process at the other end, as the kernel reports it.
-    """
+    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread."""
 
     __slots__ = (
         "_send",
@@ -193,27 +173,15 @@ class ServerConnection:
         return superseded
 
     def limit_silence(self, seconds: float) -> None:
-        """Set how long :attr:`receive` waits for a packet before it raises ``BlockingIOError``.
-
-        Args:
-            seconds: The limit [s]; 0 waits for ever.
-        """
+        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0: for ever."""
         set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
 
     def transmit(self, packet: bytes) -> None:
-        """Send a packet without waiting. Any thread.
-
-        Raises:
-            OSError: The application's buffer is full, or the application is gone.
-        """
+        """Send a packet without waiting. Any thread. ``OSError``: the application's buffer is full, or it is gone."""
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
-        """Send a packet with a file descriptor, without waiting. Any thread.
-
-        Raises:
-            OSError: The application's buffer is full, or the application is gone.
-        """
+        """Send a packet with a file descriptor, like :meth:`transmit`."""
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", (descriptor,)))
         self._socket.sendmsg((packet,), (rights,), SEND_FLAGS)
 
