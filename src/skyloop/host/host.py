@@ -205,10 +205,7 @@ class Host:
                 vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
     def close(
-        self,
-        reason: str = "the host was stopped",
-        within_s: float = 0.0,
-        hurry: Callable[[], bool] = lambda: False,
+        self, reason: str = "the host was stopped", within_s: float = 0.0, hurry: Callable[[], bool] = lambda: False
     ) -> None:
         """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
 

@@ -84,12 +84,7 @@ class HostedVehicle(ABC):
 
     @abstractmethod
     def end(
-        self,
-        within_s: float,
-        reason: str,
-        hurry: Callable[[], bool] = lambda: False,
-        *,
-        unless_flying: bool = False,
+        self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         """End the vehicle's flight and its proxy, like :meth:`skyloop.proxy.Proxy.end`. Idempotent.
 
@@ -201,12 +196,7 @@ class SharedVehicle(HostedVehicle):
         return True
 
     def end(
-        self,
-        within_s: float,
-        reason: str,
-        hurry: Callable[[], bool] = lambda: False,
-        *,
-        unless_flying: bool = False,
+        self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         if self.condition is not Condition.STOPPED:
             self._settled.wait(OPEN_S + 1.0)  # otherwise it might start to serve after its removal

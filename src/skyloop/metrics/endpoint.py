@@ -71,12 +71,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands received"),
         Family("skyloop_commands_applied_total", "counter", _VEHICLE, "commands handed to the vehicle"),
         Family("skyloop_commands_clamped_total", "counter", _VEHICLE, "commands lowered to a limit"),
-        Family(
-            "skyloop_commands_superseded_total",
-            "counter",
-            _VEHICLE,
-            "waiting commands replaced by newer ones",
-        ),
+        Family("skyloop_commands_superseded_total", "counter", _VEHICLE, "waiting commands replaced by newer ones"),
         Family("skyloop_commands_refused_total", "counter", ("vehicle", "reason"), "commands refused, by reason"),
         Family(
             "skyloop_command_delay_seconds",
@@ -105,12 +100,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_frames_received_total", "counter", ("vehicle", "camera"), "frames received from the vehicle"),
         Family("skyloop_frames_published_total", "counter", ("vehicle", "camera"), "frames published"),
         Family("skyloop_frames_missed_total", "counter", ("vehicle", "camera"), "frames missed by a subscriber"),
-        Family(
-            "skyloop_network_dropped_total",
-            "counter",
-            _VEHICLE,
-            "dropped packets to single applications",
-        ),
+        Family("skyloop_network_dropped_total", "counter", _VEHICLE, "dropped packets to single applications"),
         Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
         Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
         Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),

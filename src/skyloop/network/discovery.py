@@ -196,11 +196,7 @@ class ProxyWatch:
     """
 
     def __init__(
-        self,
-        session: Session,
-        name: str,
-        on_gone: Callable[[str], None],
-        known: packets.ProxyInfo | None = None,
+        self, session: Session, name: str, on_gone: Callable[[str], None], known: packets.ProxyInfo | None = None
     ) -> None:
         self._session = session
         self._name = name

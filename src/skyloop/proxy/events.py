@@ -62,11 +62,7 @@ class EventPublisher:
     """Numbers and publishes the events of one run. Thread-safe; never raises."""
 
     def __init__(
-        self,
-        publish: Callable[[str, bytes], int],
-        clock: Clock,
-        counters: Counters,
-        scrub: Callable[[str], str] = str,
+        self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters, scrub: Callable[[str], str] = str
     ) -> None:
         """Initialise; ``scrub`` removes secrets from a text."""
         self._scrub = scrub

@@ -42,14 +42,7 @@ from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
 from skyloop.proxy.core.failsafe import REASONS
 from skyloop.proxy.core.flight import Snapshot, Whose
 from skyloop.proxy.core.settings import FlightSettings
-from skyloop.proxy.events import (
-    EventDraft,
-    emergency_event,
-    name_of,
-    refused_event,
-    taken_event,
-    thin_zones_event,
-)
+from skyloop.proxy.events import EventDraft, emergency_event, name_of, refused_event, taken_event, thin_zones_event
 from skyloop.proxy.requests import Session
 from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS

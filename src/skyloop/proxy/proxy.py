@@ -311,11 +311,7 @@ class Proxy:
 
     def _abandon(self) -> None:
         """Release resources without waiting for hanging parts; failures go to the log."""
-        parts: tuple[Callable[[], object], ...] = (
-            self.server.stop,
-            self.driver.close,
-            self._requests.stop,
-        )
+        parts: tuple[Callable[[], object], ...] = (self.server.stop, self.driver.close, self._requests.stop)
         threads = [
             threading.Thread(target=self._give_back, args=(part,), name="skyloop-abandoned", daemon=True)
             for part in parts

@@ -40,12 +40,7 @@ from skyloop.proxy.core.command_checks import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.streams import Streams
 from skyloop.proxy.topics import PREFIX, STREAM_TOPIC, FeedbackVariants, topic_problem
-from skyloop.transport.base import (
-    FEEDBACK,
-    TransportServer,
-    stream,
-    video,
-)
+from skyloop.transport.base import FEEDBACK, TransportServer, stream, video
 
 #: While the vehicle is silent, the proxy publishes its own state (authority, links) at this interval, 4 Hz.
 KEEP_ALIVE_NS: Final = NS_PER_S // 4

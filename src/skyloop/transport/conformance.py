@@ -24,16 +24,7 @@ from functools import partial
 import numpy as np
 
 from skyloop.errors import LinkError, UsageError
-from skyloop.transport.base import (
-    FEEDBACK,
-    MAX_PACKET,
-    MAX_TOPIC,
-    Dialer,
-    Peer,
-    Pixels,
-    TransportServer,
-    video,
-)
+from skyloop.transport.base import FEEDBACK, MAX_PACKET, MAX_TOPIC, Dialer, Peer, Pixels, TransportServer, video
 from skyloop.transport.testing import (
     FRONT,
     ClientLog,
@@ -312,11 +303,7 @@ class TransportSuite(ABC):
         assert len(log.left) == 1
 
     def test_disconnect_tells_both_ends_why(self) -> None:
-        with (
-            self.serving() as (server, log),
-            self.connected(server, log) as app,
-            self.connected(server, log) as other,
-        ):
+        with self.serving() as (server, log), self.connected(server, log) as app, self.connected(server, log) as other:
             server.disconnect(app.peer, "because of this")
             wait_until(lambda: app.log.closings and log.left, "both ends were notified")
             assert log.left == [(app.peer, "because of this")]

@@ -175,14 +175,7 @@ class Authority:
     # Requests of applications ------------------------------------------------------------------------------------
 
     def request(
-        self,
-        app_id: int,
-        priority: int,
-        queue: bool,
-        now_ns: int,
-        *,
-        term_ns: int | None = None,
-        ask: bool = False,
+        self, app_id: int, priority: int, queue: bool, now_ns: int, *, term_ns: int | None = None, ask: bool = False
     ) -> list[Effect]:
         """Request the authority, or change the priority or the time of an earlier request.
 
