@@ -17,9 +17,17 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNameError, UsageError
 from skyloop.host.fleet import VehicleSettings
-from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.threads import CHECK_S, HANG_CHECKS, STALL_CHECKS, RequestWorkers, SharedLoop, Ticker, Watchdog
+from skyloop.host.threads import (
+    CHECK_S,
+    HANG_CHECKS,
+    STALL_CHECKS,
+    LinkThread,
+    RequestWorkers,
+    SharedLoop,
+    Ticker,
+    Watchdog,
+)
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy

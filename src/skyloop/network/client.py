@@ -1,23 +1,28 @@
-"""The application's end of the fabric transport."""
+"""The application's end of the fabric transport, and the topics to which it has subscribed."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
+from skyloop.messages import FrameHeader
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
 from skyloop.network.config import FabricSettings, Part
-from skyloop.network.delivery import DEPTH, Outgoing, Receiver
+from skyloop.network.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, Outgoing, Receiver, RecentPackets
 from skyloop.network.discovery import SYNC_S, ProxyWatch, join, proxy_reached, renew
-from skyloop.network.sealing import contents
+from skyloop.network.frames import WINDOW
+from skyloop.network.sealing import Opener, contents
 from skyloop.network.session import Session, acquire, load, release, retire, undeclare
-from skyloop.network.subscription import Subscription
 from skyloop.transport.base import (
     MAX_PACKET,
     ClientHandler,
@@ -26,6 +31,7 @@ from skyloop.transport.base import (
     check_name,
     check_packet,
     check_topic,
+    video,
 )
 
 if TYPE_CHECKING:
@@ -40,6 +46,8 @@ POLL_S: Final = 0.05  #: interval between checks for packets to resend
 STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
 KEYS_S: Final = 0.5  #: interval between checks for a newer roster
 FAREWELL_S: Final = 0.3  #: time to wait for an answer to a bye
+_VIDEO: Final = video("")
+_UNNUMBERED: Final = packets.number(0)
 _log = logging.getLogger(__name__)
 
 
@@ -96,6 +104,99 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
                     raise
 
     return dialer
+
+
+class Subscription:
+    """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
+
+    ``run``: the proxy's run; packets that others publish under its name are ignored. ``enqueue``: called with this
+    subscription, a packet (empty: a frame is due) and its number, which must be passed to :meth:`deliver` in order.
+    ``reject``: called with the reason when a packet did not come from the proxy.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        run: bytes,
+        opener: Opener,
+        enqueue: Callable[[Subscription, bytes, int], object],
+        reject: Callable[[DecodeError], None],
+    ) -> None:
+        self._topic = topic
+        self._run = run
+        self._opener = opener
+        self._enqueue = enqueue
+        self._reject = reject
+        #: Whether only the newest packet counts, so that packets and their acknowledgements are sent as datagrams.
+        self.newest_wins = layout.newest_wins(topic)
+        self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
+        self._recent = RecentPackets()
+        self._waiting = 0  # number of waiting packets
+        self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
+        self._newest = 0  # number of the newest frame received
+        self._ended = False
+
+    def declare(self, session: Session, name: str, connection: str) -> list[Any]:
+        """Subscribe on a Zenoh session. The caller must undeclare the returned declarations."""
+        z, call, topic = session.zenoh, session.callback, self._topic
+        if not topic.startswith(_VIDEO):
+            return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
+        camera, _, form = topic.removeprefix(_VIDEO).partition("?")
+        keys = (layout.video(name, camera, form), layout.video_for(name, camera, form, connection))
+        return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
+
+    def end(self) -> None:
+        """Stop delivering frames, including queued ones."""
+        self._ended = True
+
+    def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
+        """Deliver the next item to the handler; return the packet that acknowledges it, empty if none is needed."""
+        if packet:
+            self._waiting -= 1
+            handler.packet(packet)
+            return packets.taken(self._topic, number) if self._ack_policy.count(number, 0, time.monotonic()) else b""
+        number, header, data = self._frames.popleft()
+        if self._ended:
+            return b""
+        handler.frame(header, np.frombuffer(data, np.uint8), self._topic)
+        return packets.seen(self._topic, number)
+
+    # --- callbacks, on Zenoh's threads ---
+
+    def _on_packet(self, sample: zenoh.Sample) -> None:
+        try:
+            opened = contents(self._opener, sample)
+            if opened is None:
+                return
+            packet = opened[0]
+            run, number = packets.parse_published(opened[1])
+        except DecodeError as error:
+            self._reject(error)
+            return
+        if run == self._run and self._waiting < DEPTH and self._recent.is_new(number, packet):
+            self._waiting += 1
+            self._enqueue(self, packet, number)
+
+    def _on_frame(self, sample: zenoh.Sample) -> None:
+        """Queue a frame, replacing one that is already queued."""
+        opener = self._opener
+        try:
+            attachment = packets.copied(sample.attachment, packets.MAX_OWN)
+            run, number, header = packets.parse_frame(attachment[: len(attachment) - opener.trailer])
+            if run != self._run or number <= self._newest or len(sample.payload) != header.size + opener.tag:
+                return
+            opened = opener.open(str(sample.key_expr), attachment, bytes(sample.payload))
+            if opened is None:
+                return
+        except DecodeError as error:
+            self._reject(error)
+            return
+        self._newest = number
+        if len(self._frames) >= WINDOW:
+            self._frames[-1] = (number, header, opened[0])
+        else:
+            self._frames.append((number, header, opened[0]))
+            self._enqueue(self, b"", number)
 
 
 #: For the receiving thread: a packet of a topic (None: for this end only; empty: a frame) and its number.
@@ -465,6 +566,3 @@ class FabricClient(TransportClient):
                 self._send_report(packet)
             else:
                 self._put(layout.ASK, packet, 0)
-
-
-_UNNUMBERED: Final = packets.number(0)

@@ -118,8 +118,8 @@ class FabricSettings:
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
     """Return these settings with keys: mutual TLS over QUIC, and access control based on their roster."""
-    from skyloop.network.access import access_control
     from skyloop.network.keys import KeyRing  # imported only if there are keys: needs cryptography
+    from skyloop.network.keys.identity import access_control
 
     return replace(
         settings,

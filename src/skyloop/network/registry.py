@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
+from collections.abc import Hashable
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import msgspec
 
@@ -16,7 +18,6 @@ from skyloop.errors import DecodeError, LinkError
 from skyloop.network import layout, packets
 from skyloop.network.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
 from skyloop.network.connection import Publisher, Sender, ServerConnection
-from skyloop.network.handler_queue import HandlerQueue
 from skyloop.network.sealing import Seal, TopicSeal
 from skyloop.network.session import load
 from skyloop.transport.base import NOBODY, Peer, ServerHandler
@@ -31,6 +32,11 @@ CONFIRM_S: Final = 3.0  #: time for an admitted application to declare its token
 #: slow the application's own code is.
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
+
+T = TypeVar("T")
+#: After this number of consecutive commands, handle one other packet, so that endless commands can't stop others from
+#: requesting authority.
+IN_A_ROW: Final = 16
 
 #: Items for the thread that calls the handler: a packet, True for joined, or False for left.
 Item = tuple[ServerConnection, bytes | bool]
@@ -327,3 +333,89 @@ class ConnectionRegistry:
         if not connection.ended:
             connection.reason = connection.reason or reason
             self.send_own(connection, packets.bye(reason))
+
+
+# The queue for the thread that calls the handler -------------------------------------------------------------------
+
+
+class _TurnQueue(Generic[T]):
+    """One queue per connection; the connections take turns, so that one with many items doesn't delay the others."""
+
+    def __init__(self) -> None:
+        self._order: deque[Hashable] = deque()
+        self._waiting: dict[Hashable, deque[T]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._order)
+
+    def count(self, of: Hashable) -> int:
+        return len(self._waiting.get(of, ()))
+
+    def put(self, of: Hashable, item: T) -> None:
+        waiting = self._waiting.get(of)
+        if waiting is None:
+            self._waiting[of] = deque((item,))
+            self._order.append(of)
+        else:
+            waiting.append(item)
+
+    def get(self) -> T:
+        of = self._order.popleft()
+        waiting = self._waiting[of]
+        item = waiting.popleft()
+        if waiting:
+            self._order.append(of)
+        else:
+            del self._waiting[of]
+        return item
+
+
+class HandlerQueue(Generic[T]):
+    """The queue for the thread that calls a handler: commands come first, and connections take turns.
+
+    Items of equal urgency from one connection stay in order.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._urgent: _TurnQueue[T] = _TurnQueue()
+        self._others: _TurnQueue[T] = _TurnQueue()
+        self._in_a_row = 0
+        self._closed = False
+
+    def put(self, of: Hashable, item: T, *, urgent: bool = False, at_most: int | None = None) -> bool:
+        """Queue a connection's item, urgent ones first; refuse it if ``at_most`` are waiting. Any thread."""
+        with self._changed:
+            queue = self._urgent if urgent else self._others
+            if at_most is not None and queue.count(of) >= at_most:
+                return False
+            queue.put(of, item)
+            self._changed.notify()
+            return True
+
+    def waiting(self, of: Hashable) -> int:
+        """Return how many of a connection's non-urgent items are queued."""
+        with self._changed:
+            return self._others.count(of)
+
+    def close(self) -> None:
+        """Stop :meth:`get` from waiting; it still returns items already queued."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> T | None:
+        """Return the next item, or None after the time-out or if the queue is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
+            if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):
+                self._in_a_row += 1
+                return self._urgent.get()
+            self._in_a_row = 0
+            return self._others.get() if self._others else None
+
+    @property
+    def over(self) -> bool:
+        """Whether the queue is closed and empty."""
+        with self._changed:
+            return self._closed and not self._urgent and not self._others

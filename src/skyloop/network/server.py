@@ -19,8 +19,7 @@ from skyloop.messages import FrameHeader
 from skyloop.network import discovery, layout, packets
 from skyloop.network.config import FabricSettings, Part
 from skyloop.network.connection import MAX_WAITING, Publisher, Sender, ServerConnection
-from skyloop.network.handler_queue import HandlerQueue
-from skyloop.network.registry import ConnectionRegistry, Item
+from skyloop.network.registry import ConnectionRegistry, HandlerQueue, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet

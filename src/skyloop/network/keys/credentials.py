@@ -16,6 +16,11 @@ from __future__ import annotations
 
 import base64
 import binascii
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -23,9 +28,8 @@ from typing import Final
 
 import msgspec
 
-from skyloop.errors import FileFormatError, UsageError
-from skyloop.files import expand
-from skyloop.network.keys import files
+from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.files import expand, read_bytes
 from skyloop.network.keys.certificates import (
     Authority,
     Certificate,
@@ -46,6 +50,8 @@ AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
+MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities has 3 MB
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
 
 
@@ -194,8 +200,8 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     path = expand(directory).resolve()
     _check_folder(path)
     certificate_path, key_path = path / CERTIFICATE_FILE, path / KEY_FILE
-    key = read_key(files.read_private(key_path, "the private key"), key_path)
-    certificate = read_certificate(files.read(certificate_path, "the certificate"), certificate_path)
+    key = read_key(read_private(key_path, "the private key"), key_path)
+    certificate = read_certificate(read(certificate_path, "the certificate"), certificate_path)
     authority = _read_authority(path)
     if not matches(key, certificate):
         raise UsageError(f"{key_path} does not belong to the certificate {certificate_path}: copy both from one folder")
@@ -231,12 +237,12 @@ def expiry_warning(what: str, end: datetime, now: datetime) -> str:
 
 def _read_authority(directory: Path) -> Authority:
     path = directory / AUTHORITY_FILE
-    return read_authority(read_certificate(files.read(path, "the authority's certificate"), path), None, path)
+    return read_authority(read_certificate(read(path, "the authority's certificate"), path), None, path)
 
 
 def _read_roster(directory: Path, authority: Authority) -> Roster:
     path = directory / ROSTER_FILE
-    return decode_roster(files.read(path, "the roster"), authority, path)
+    return decode_roster(read(path, "the roster"), authority, path)
 
 
 def _check_folder(path: Path) -> None:
@@ -260,3 +266,69 @@ def _check_listed(identity: Identity, roster: Roster, path: Path) -> None:
             f"the key {path} is of {identity}, but the roster says {entry.identity}: the key was replaced, "
             "use the new one"
         )
+
+
+# Files that hold keys: access rights and atomic replacement -----------------------------------------------------------
+
+
+def make_directory(path: Path) -> None:
+    """Create a directory that only its owner can enter, or check an existing one."""
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise UsageError(f"{path} can't be made: {error.strerror}") from None
+    if mode & _OTHERS:
+        raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
+
+
+def write(path: Path, content: bytes, *, private: bool = False) -> None:
+    """Replace a file atomically. A private one is readable only by its owner, from the first byte on."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UsageError(f"{path} can't be written: {error.strerror}") from None
+
+
+def read(path: Path, what: str) -> bytes:
+    """Read a file of at most :data:`MAX_BYTES`."""
+    return read_bytes(path, what, MAX_BYTES)
+
+
+def read_private(path: Path, what: str) -> bytes:
+    """Read a file that must not be accessible to others, because they might have copied the key."""
+    content = read(path, what)
+    mode = path.stat().st_mode
+    if mode & _OTHERS:
+        raise UsageError(
+            f"{what} {path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 600 it, and issue a new one if "
+            "others may have read it"
+        )
+    return content
+
+
+@contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Lock a directory against changes by other processes; wait while one of them holds the lock.
+
+    The kernel releases the lock when the process ends.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        raise UnsupportedError(
+            f"keys are made and revoked on Linux or macOS, but this is {sys.platform}; copy issued keys to this machine"
+        ) from None
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

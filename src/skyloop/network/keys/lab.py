@@ -32,7 +32,7 @@ from typing import Final
 import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.network.keys import certificates, files
+from skyloop.network.keys import certificates
 from skyloop.network.keys.certificates import Authority
 from skyloop.network.keys.credentials import (
     AUTHORITY_FILE,
@@ -43,6 +43,11 @@ from skyloop.network.keys.credentials import (
     Roster,
     decode_roster,
     encode_roster,
+    locked,
+    make_directory,
+    read,
+    read_private,
+    write,
 )
 from skyloop.network.keys.identity import Identity
 
@@ -72,16 +77,16 @@ class Lab:
         """Create a new authority in a new folder, valid for 1 to 36500 days."""
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
-        files.make_directory(directory)
-        with files.locked(directory):
+        make_directory(directory)
+        with locked(directory):
             if (directory / _AUTHORITY_KEY).exists():
                 raise UsageError(f"{directory} already has an authority: a new one would make all its keys worthless")
             authority = certificates.make_authority(days, _now(now))
             assert authority.key is not None
             lab = cls(directory, authority)
-            files.write(directory / AUTHORITY_FILE, certificates.certificate_pem(authority.certificate))
+            write(directory / AUTHORITY_FILE, certificates.certificate_pem(authority.certificate))
             lab._write_roster(Roster(1, authority.name))
-            files.write(directory / _AUTHORITY_KEY, certificates.key_pem(authority.key), private=True)
+            write(directory / _AUTHORITY_KEY, certificates.key_pem(authority.key), private=True)
         return lab
 
     @classmethod
@@ -90,8 +95,8 @@ class Lab:
         key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
         if not key_path.exists():
             raise UsageError(f"there is no authority in {directory}: make one with skyloop keys init")
-        key = certificates.read_key(files.read_private(key_path, "the authority's key"), key_path)
-        content = files.read(certificate_path, "the authority's certificate")
+        key = certificates.read_key(read_private(key_path, "the authority's key"), key_path)
+        content = read(certificate_path, "the authority's certificate")
         certificate = certificates.read_certificate(content, certificate_path)
         return cls(directory, certificates.read_authority(certificate, key, certificate_path))
 
@@ -102,7 +107,7 @@ class Lab:
         Raises :class:`UsageError` if it can't be read or was modified.
         """
         path = self.directory / ROSTER_FILE
-        return decode_roster(files.read(path, "the roster"), self.authority, path)
+        return decode_roster(read(path, "the roster"), self.authority, path)
 
     def folder(self, name: str) -> Path:
         """Return the path of an identity's folder."""
@@ -117,7 +122,7 @@ class Lab:
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
         certificates.check_time(self.authority.certificate, "the lab's authority", now)
-        with files.locked(self.directory):
+        with locked(self.directory):
             before = self.roster.find(identity.name)
             if before is not None and before.revoked and now < before.last_at:
                 raise UsageError(
@@ -128,10 +133,10 @@ class Lab:
             certificate = certificates.issue(self.authority, identity, key, now + timedelta(days=days), now)
             entry = _entry(identity, certificate.serial_number, certificate.not_valid_after_utc, before)
             folder = self.folder(identity.name)
-            files.make_directory(folder)
-            files.write(folder / KEY_FILE, certificates.key_pem(key), private=True)
-            files.write(folder / CERTIFICATE_FILE, certificates.certificate_pem(certificate))
-            files.write(folder / AUTHORITY_FILE, certificates.certificate_pem(self.authority.certificate))
+            make_directory(folder)
+            write(folder / KEY_FILE, certificates.key_pem(key), private=True)
+            write(folder / CERTIFICATE_FILE, certificates.certificate_pem(certificate))
+            write(folder / AUTHORITY_FILE, certificates.certificate_pem(self.authority.certificate))
             self._write_roster(self.roster.put(entry))
         return entry
 
@@ -140,7 +145,7 @@ class Lab:
 
         The revocation takes effect wherever the new roster is installed.
         """
-        with files.locked(self.directory):
+        with locked(self.directory):
             roster = self.roster
             entry = roster.find(name)
             if entry is None:
@@ -159,11 +164,11 @@ class Lab:
         Every folder copied from now on therefore has the newest one.
         """
         content = encode_roster(roster, self.authority)
-        files.write(self.directory / ROSTER_FILE, content)
+        write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:
             folder = self.folder(entry.name)
             if not entry.revoked and folder.is_dir():
-                files.write(folder / ROSTER_FILE, content)
+                write(folder / ROSTER_FILE, content)
 
 
 def _entry(identity: Identity, serial: int, end: datetime, before: Entry | None) -> Entry:
@@ -195,10 +200,10 @@ def page_certificate(
     names given by the user, which it must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now
-    files.make_directory(directory.parent)
-    files.make_directory(directory)
+    make_directory(directory.parent)
+    make_directory(directory)
     made = PageFiles(directory / "page.pem", directory / "page.key", directory / "ca.pem")
-    with files.locked(directory):
+    with locked(directory):
         authority = _authority(directory, made.authority, [*own, *wanted], now)
         for name in wanted:
             if not certificates.may_certify(authority, name):
@@ -213,8 +218,8 @@ def page_certificate(
         if not _fits(made, authority, names, now):
             key = certificates.new_key()
             page = certificates.issue_page(authority, names, key, now + timedelta(days=PAGE_DAYS), now)
-            files.write(made.key, certificates.key_pem(key), private=True)
-            files.write(made.certificate, certificates.certificate_pem(page))
+            write(made.key, certificates.key_pem(key), private=True)
+            write(made.certificate, certificates.certificate_pem(page))
     left_out = tuple(name for name in own if not certificates.may_certify(authority, name))
     return PageFiles(made.certificate, made.key, made.authority, left_out)
 
@@ -222,23 +227,23 @@ def page_certificate(
 def _authority(directory: Path, path: Path, names: Sequence[str], now: datetime) -> Authority:
     key_path = directory / "ca.key"
     if key_path.exists():
-        key = certificates.read_key(files.read_private(key_path, "the key of the pages' authority"), key_path)
-        certificate = certificates.read_certificate(files.read(path, "the pages' authority"), path)
+        key = certificates.read_key(read_private(key_path, "the key of the pages' authority"), key_path)
+        certificate = certificates.read_certificate(read(path, "the pages' authority"), path)
         authority = certificates.read_authority(certificate, key, path)
         if authority.expires - now > timedelta(days=RENEWED_DAYS):
             return authority
     more = [name.lower() for name in names if not _is_address(name)]
     authority = certificates.make_page_authority(more, AUTHORITY_DAYS, now)
     assert authority.key is not None
-    files.write(path, certificates.certificate_pem(authority.certificate))
-    files.write(key_path, certificates.key_pem(authority.key), private=True)
+    write(path, certificates.certificate_pem(authority.certificate))
+    write(key_path, certificates.key_pem(authority.key), private=True)
     return authority
 
 
 def _fits(made: PageFiles, authority: Authority, names: Sequence[str], now: datetime) -> bool:
     if not (made.certificate.exists() and made.key.exists()):
         return False
-    page = certificates.read_certificate(files.read(made.certificate, "the page's certificate"), made.certificate)
+    page = certificates.read_certificate(read(made.certificate, "the page's certificate"), made.certificate)
     try:
         certificates.check_issued(page, authority, made.certificate)
     except UsageError:
