@@ -40,27 +40,6 @@ _RESULTS: Final = results("")
 class ServerConnection:
     """An application connected to the transport server. Its lock guards its outgoing packets and its topics."""
 
-    __slots__ = (
-        "_own",
-        "_taken",
-        "admission",
-        "announced",
-        "commands",
-        "confirmed",
-        "ended",
-        "id",
-        "joined_s",
-        "left",
-        "lock",
-        "outgoing",
-        "paces",
-        "peer",
-        "reason",
-        "receiver",
-        "topics",
-        "who",
-    )
-
     def __init__(self, peer: Peer, who: str, connection: str, joined_s: float, admission: Admission) -> None:
         self.peer = peer
         self.who = who

@@ -57,20 +57,6 @@ _log = logging.getLogger(__name__)
 class Session:
     """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
 
-    __slots__ = (
-        "_malformed_ns",
-        "answers",
-        "app_id",
-        "authority_request",
-        "ended",
-        "episodes",
-        "intents",
-        "joined_ns",
-        "name",
-        "peer",
-        "role",
-    )
-
     def __init__(self, peer: Peer, joined_ns: int) -> None:
         self.peer = peer
         self.joined_ns = joined_ns
@@ -94,8 +80,6 @@ class Session:
 
 class Answers:
     """The pending requests of one connection, and the answers stored for repeats. Not thread-safe."""
-
-    __slots__ = ("_forgotten", "_pending", "kept")
 
     def __init__(self) -> None:
         self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request

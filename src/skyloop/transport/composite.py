@@ -127,8 +127,11 @@ class _EndHandler:
             self._handler.peer_joined(ours)
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        with self._lock.urgent if is_command(packet) else self._lock:
+        self._lock.acquire(is_command(packet))
+        try:
             self._handler.packet(self._peers[peer.id], packet)
+        finally:
+            self._lock.release()
 
     def refused(self, peer: Peer, reason: str) -> None:
         with self._lock:

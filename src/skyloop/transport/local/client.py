@@ -355,7 +355,7 @@ class Leases:
         from here to the client, its handler and the frames that it keeps would keep all of them alive forever.
         """
         self._slots.clear()
-        self._send_release = _discard_release
+        self._send_release = lambda _: None
 
     def pixels(self, number: int, size: int) -> Pixels:
         """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames."""
@@ -374,7 +374,3 @@ class Leases:
         """Return a slot to the server, now that the application's last array over it is gone."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)
-
-
-def _discard_release(_: int) -> None:
-    """Drop a release, because the connection has ended."""

@@ -9,6 +9,7 @@ import pwd
 import select
 import socket
 import struct
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from skyloop.transport.base import MAX_PACKET, Peer
@@ -45,18 +46,11 @@ class Socket(socket.socket):
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         """End the connection in both directions, after a last packet if it fits."""
-        try:
-            if last_packet:
+        if last_packet:
+            with suppress(OSError):
                 self.send(last_packet, SEND_FLAGS)
+        with suppress(OSError):  # it had already ended
             self.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            self._shut_down_quietly()
-
-    def _shut_down_quietly(self) -> None:
-        try:
-            self.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            return  # it had already ended
 
 
 class Credentials(NamedTuple):
@@ -111,22 +105,6 @@ def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
 
 class ServerConnection:
     """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread."""
-
-    __slots__ = (
-        "_send",
-        "_socket",
-        "admitted",
-        "backlog",
-        "ending",
-        "joined",
-        "peer",
-        "pilot",
-        "poll",
-        "reason",
-        "receive",
-        "topics",
-        "who",
-    )
 
     def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
