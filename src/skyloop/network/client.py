@@ -344,26 +344,16 @@ class FabricClient(TransportClient):
 
     def _send_command(self, packet: bytes) -> bool:
         if self._command is None:
-            self._command = self._best_effort(self._command_key, load().Priority.REAL_TIME)
+            self._command = self._session.publisher(self._command_key, "REAL_TIME", best_effort=True)
         return self._send_once(self._command, self._command_key, packet)
 
     def _send_report(self, packet: bytes) -> bool:
         if self._report is None:
-            self._report = self._best_effort(self._report_key, load().Priority.DATA_HIGH)
+            self._report = self._session.publisher(self._report_key, "DATA_HIGH", best_effort=True)
         return self._send_once(self._report, self._report_key, packet)
 
-    def _best_effort(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
-        z = load()
-        return self._session.zenoh.declare_publisher(
-            key,
-            congestion_control=z.CongestionControl.DROP,
-            priority=priority,
-            reliability=z.Reliability.BEST_EFFORT,
-            express=True,
-        )
-
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost and that nobody waits for."""
+        """Send a packet that may be lost, without waiting."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)
@@ -387,19 +377,11 @@ class FabricClient(TransportClient):
             self._put(way, packet, number)
 
     def _put(self, way: str, packet: bytes, number: int) -> bool:
-        z = load()
         key = layout.upward(way, self._name, self._who, self._id)
-        payload, attachment = self._admission.sealer.seal(key, packets.number(number), packet)
+        sealed = self._admission.sealer.seal(key, packets.number(number), packet)
         try:
-            self._session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_HIGH,
-                express=True,
-            )
-        except z.ZError as error:
+            self._session.put(key, *sealed, "DATA_HIGH")
+        except load().ZError as error:
             _log.debug("%s: not sent: %s", self._name, error)
             return False
         return True

@@ -19,8 +19,8 @@ from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
 from skyloop.network.frames import FramePublisher, Variant
 from skyloop.network.sealing import Sealer
-from skyloop.network.session import Session, load
-from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, Pixels, results, stream, too_many_topics, video
+from skyloop.network.session import Priority, Session, load
+from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, results, stream, too_many_topics, video
 from skyloop.transport.priority import PacketBacklog
 
 if TYPE_CHECKING:
@@ -232,26 +232,14 @@ class Publisher:
                 publisher = self._publishers[topic] = self._declare(session, topic)
         key = layout.topic(self._name, topic)
         payload, attachment = self._sealer.seal(key, packets.published(self._run, number), packet)
-        z = load()
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
             else:  # the topic was named by an application: leave no declaration behind
-                session.zenoh.put(
-                    key,
-                    payload,
-                    attachment=attachment,
-                    congestion_control=z.CongestionControl.DROP,
-                    priority=z.Priority.DATA,
-                    express=True,
-                )
-        except z.ZError:
+                session.put(key, payload, attachment, "DATA")
+        except load().ZError:
             return len(subscribed)  # stopping
         return sum(connection.lags(topic, number) for connection in subscribed)
-
-    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that will miss it."""
-        return self.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
         """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
@@ -309,22 +297,16 @@ class Publisher:
                 self._publishers.pop(topic, None)  # it ends with its last user
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
-        z = load()
         newest_wins = layout.newest_wins(topic)
-        usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # the same as for frames
-        return session.zenoh.declare_publisher(
-            layout.topic(self._name, topic),
-            congestion_control=z.CongestionControl.DROP,
-            priority=z.Priority.REAL_TIME if newest_wins else usual,
-            reliability=z.Reliability.BEST_EFFORT if newest_wins else z.Reliability.RELIABLE,
-            express=True,
-        )
+        usual: Priority = "DATA_LOW" if topic.startswith(_STREAMS) else "DATA"  # the same as for frames
+        priority: Priority = "REAL_TIME" if newest_wins else usual
+        return session.publisher(layout.topic(self._name, topic), priority, best_effort=newest_wins)
 
     def _send_frame(
         self, variant: Variant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
         """Send an encoded frame. Called on the camera's thread."""
-        z, session, request = load(), self._session, variant.request
+        session, request = self._session, variant.request
         if session is None:
             return
         camera, form = request.camera, request.variant
@@ -335,12 +317,4 @@ class Publisher:
         )
         described = packets.frame(self._run, number, encode(header))
         for key in keys:
-            payload, attachment = self._sealer.seal(key, described, data)
-            session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_LOW,
-                express=True,
-            )
+            session.put(key, *self._sealer.seal(key, described, data), "DATA_LOW")

@@ -146,7 +146,7 @@ class FabricServer(TransportServer):
 
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
         check_frame(header, pixels)
-        return self._publisher.publish_frame(header, pixels)
+        return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
         """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
@@ -185,21 +185,14 @@ class FabricServer(TransportServer):
 
     def _put_to(self, connection: ServerConnection, packet: bytes, number: int) -> bool:
         """Send a packet to one application. Called on the sender's thread."""
-        z, session = load(), self._session
+        session = self._session
         if session is None:
             return False
         key = layout.to(self._name, connection.id)
-        payload, attachment = connection.admission.sealer.seal(key, packets.number(number), packet)
+        sealed = connection.admission.sealer.seal(key, packets.number(number), packet)
         try:
-            session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_HIGH,
-                express=True,
-            )
-        except z.ZError as error:
+            session.put(key, *sealed, "DATA_HIGH")
+        except load().ZError as error:
             _log.debug("%s: not sent to %s: %s", self.address, connection.peer.address, error)
             return False
         return True

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.network import config
@@ -31,6 +31,7 @@ _BORROWED_S: Final = 0.001  # … and the pause between them
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
 _ATTEMPTS: Final = 5  # attempts to get a free port before another process takes it
+Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: Zenoh's priorities in use, highest first
 
 
 class Session:
@@ -54,6 +55,21 @@ class Session:
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
+
+    def put(self, key: str, payload: bytes, attachment: bytes, priority: Priority) -> None:
+        """Send a packet; it is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
+        z = load()
+        drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
+        self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
+
+    def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
+        """Declare a publisher of packets that are dropped if the path is congested, or also on the way."""
+        z = load()
+        reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
+        drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
+        return self.zenoh.declare_publisher(
+            key, congestion_control=drop, priority=level, reliability=reliability, express=True
+        )
 
     def peers(self) -> set[str]:
         """Return the common names in the certificates of all linked nodes; empty without keys."""
