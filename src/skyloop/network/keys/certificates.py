@@ -90,37 +90,18 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 def make_authority(days: int, now: datetime) -> Authority:
     """Create the authority of a new lab. Its name ends in random digits to distinguish labs."""
-    key = new_key()
-    name = _name(f"Skyloop lab {secrets.token_hex(4)}")
-    certificate = (
-        _builder(name, name, key, now, now + timedelta(days=days))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(authority=True), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    return Authority(certificate, key)
+    return _self_signed(f"Skyloop lab {secrets.token_hex(4)}", days, now)
 
 
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
     """Create a certificate for an identity, signed with the authority's key and valid no longer than the authority."""
-    assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
-    issuer = authority.certificate
-    end = min(until, issuer.not_valid_after_utc)
     urn = x509.UniformResourceIdentifier(f"{_URN}{identity.role}:{','.join(identity.drones)}")
-    return (
-        _builder(_name(identity.name), issuer.subject, key, now, end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(authority=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
-        .add_extension(x509.SubjectAlternativeName([urn]), critical=False)
-        .sign(authority.key, hashes.SHA256())
-    )
+    return _issued(authority, identity.name, key, until, now, purposes, [urn])
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
@@ -129,39 +110,17 @@ def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Autho
     Its certificates are valid for private addresses, names on local networks, and the given names. A browser that
     trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
     """
-    key = new_key()
-    name = _name(f"Skyloop pages {secrets.token_hex(4)}")
     permitted: list[x509.GeneralName] = [x509.IPAddress(ipaddress.ip_network(network)) for network in PAGE_NETWORKS]
     permitted += [x509.DNSName(each) for each in dict.fromkeys([*PAGE_NAMES, *names])]
-    certificate = (
-        _builder(name, name, key, now, now + timedelta(days=days))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(authority=True), critical=True)
-        .add_extension(x509.NameConstraints(permitted, None), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    return Authority(certificate, key)
+    return _self_signed(f"Skyloop pages {secrets.token_hex(4)}", days, now, x509.NameConstraints(permitted, None))
 
 
 def issue_page(
     authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Create a certificate for a cockpit's page, reached by these IP addresses and host names, valid in UTC.
-
-    It expires no later than that of the authority.
-    """
-    assert authority.key is not None
-    issuer = authority.certificate
-    end = min(until, issuer.not_valid_after_utc)
-    return (
-        _builder(_name("Skyloop cockpit"), issuer.subject, key, now, end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(authority=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
-        .add_extension(x509.SubjectAlternativeName([_general_name(each) for each in names]), critical=False)
-        .sign(authority.key, hashes.SHA256())
-    )
+    """Create a certificate for a cockpit's page, reached by these IP addresses and host names; see :func:`issue`."""
+    reached = [_general_name(each) for each in names]
+    return _issued(authority, "Skyloop cockpit", key, until, now, [ExtendedKeyUsageOID.SERVER_AUTH], reached)
 
 
 def page_names(certificate: x509.Certificate) -> list[str]:
@@ -301,28 +260,39 @@ def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     return public
 
 
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: PrivateKey, now: datetime, end: datetime
-) -> x509.CertificateBuilder:
-    public = key.public_key()
+def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> Authority:
+    key, name = new_key(), _name(title)
+    builder = _builder(name, name, key, now, now + timedelta(days=days), authority=True)
+    for constraint in constraints:
+        builder = builder.add_extension(constraint, critical=True)
+    return Authority(builder.sign(key, hashes.SHA256()), key)
+
+
+def _issued(
+    authority: Authority,
+    title: str,
+    key: PrivateKey,
+    until: datetime,
+    now: datetime,
+    purposes: list[x509.ObjectIdentifier],
+    names: Sequence[x509.GeneralName],
+) -> x509.Certificate:
+    assert authority.key is not None
+    issuer = authority.certificate
     return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(public)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - BACKDATED)
-        .not_valid_after(end)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        _builder(_name(title), issuer.subject, key, now, min(until, issuer.not_valid_after_utc), authority=False)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .sign(authority.key, hashes.SHA256())
     )
 
 
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
-
-
-def _usage(*, authority: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: PrivateKey, now: datetime, end: datetime, *, authority: bool
+) -> x509.CertificateBuilder:
+    public = key.public_key()
+    usage = x509.KeyUsage(
         digital_signature=True,
         content_commitment=False,
         key_encipherment=False,
@@ -333,3 +303,19 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - BACKDATED)
+        .not_valid_after(end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
+        .add_extension(usage, critical=True)
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
