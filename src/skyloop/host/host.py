@@ -73,8 +73,7 @@ class Host:
 
     def proxies(self) -> list[Proxy]:
         """Return the proxies currently serving in this process. Any thread."""
-        present = (vehicle.proxy for vehicle in list(self.vehicles.values()) if isinstance(vehicle, SharedVehicle))
-        return [proxy for proxy in present if proxy is not None]
+        return [vehicle.proxy for vehicle in list(self.vehicles.values()) if vehicle.proxy is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
 
@@ -104,7 +103,7 @@ class Host:
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
             # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
-            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
+            if vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
 
@@ -150,7 +149,7 @@ class Host:
                 f"remove it anyway: skyloop host remove {name} --land",
                 code="flown",
             )
-        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        proxy = vehicle.proxy
         if not self._end(vehicle, timeout_s, "it was removed from its host", unless_flying=True):
             raise RefusedError(
                 f"{name} has not landed within {timeout_s:g} s and is not removed: it keeps landing and accepts no "
@@ -172,7 +171,7 @@ class Host:
         *,
         unless_flying: bool = False,
     ) -> bool:
-        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        proxy = vehicle.proxy
         ended = vehicle.end(within_s, reason, hurry, unless_flying=unless_flying)
         if ended and proxy is not None:
             self._forget(proxy)
@@ -208,9 +207,8 @@ class Host:
 
     def publish_keys(self, change: str) -> None:
         """Publish updates about the network's keys to all clients."""
-        for vehicle in list(self.vehicles.values()):
-            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-                vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
+        for proxy in self.proxies():
+            proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
     def close(
         self, reason: str = "the host was stopped", within_s: float = 0.0, hurry: Callable[[], bool] = lambda: False
@@ -229,8 +227,7 @@ class Host:
                 self._end(vehicle, within_s, reason, lambda: hurry() or interrupted.is_set())
 
             def tell(vehicle: HostedVehicle) -> None:
-                proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
-                if proxy is not None and within_s > 0.0:
+                if (proxy := vehicle.proxy) is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
             # Use one thread per vehicle: a driver that hangs must not keep another vehicle in the air.

@@ -91,7 +91,6 @@ class OwnProcessVehicle(HostedVehicle):
             self._reported, self._silent_checks = None, 0
 
     def _read(self, child: ChildProcess) -> None:
-        """Read the reports of a process."""
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)

@@ -31,7 +31,7 @@ from skyloop.errors import (
 )
 from skyloop.host.fleet import Defaults, Fleet, Vehicle, VehicleSettings, decoder_of_handed, encode_handed, settings_of
 from skyloop.host.host import Host, check_known
-from skyloop.host.vehicle import HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of
+from skyloop.host.vehicle import HostedVehicle, VehicleStatus, network_of, reason_of
 from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, on_signals
@@ -144,8 +144,8 @@ class _Lines:
 
 
 def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
-    if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-        return f"{status.address} at {vehicle.proxy.server.address}"
+    if (proxy := vehicle.proxy) is not None:
+        return f"{status.address} at {proxy.server.address}"
     return f"{status.address} at local:{status.name}, process {status.pid}"
 
 
@@ -227,7 +227,6 @@ class ControlServer:
         self._ended = threading.Event()
 
     def start(self) -> None:
-        """Start listening."""
         self._listener, self._inode = self._directory.listen(self._name)
         self._thread = threading.Thread(
             target=self._run, args=(self._listener,), name="skyloop-host-control", daemon=True

@@ -139,7 +139,6 @@ class RequestWorkers:
         self._closed = False
 
     def queue(self) -> PooledJobQueue:
-        """Return the job queue for one proxy."""
         return PooledJobQueue(self)
 
     def close(self) -> None:
@@ -264,7 +263,6 @@ class Watchdog:
         self._thread = threading.Thread(target=self._run, name="skyloop-watchdog", daemon=True)
 
     def start(self) -> None:
-        """Start checking."""
         self._thread.start()
 
     def close(self) -> None:
@@ -274,7 +272,6 @@ class Watchdog:
             self._thread.join()
 
     def check(self, now_s: float) -> None:
-        """Check once."""
         punctual = now_s - self._checked_s < 2 * CHECK_S
         self._checked_s = now_s
         seen: dict[SharedLoop, tuple[int, int]] = {}

@@ -73,6 +73,7 @@ class HostedVehicle(ABC):
         self.condition = Condition.STOPPED
         self.failed = ""  #: the reason, if it has failed
         self.started_s = time.monotonic()
+        self.proxy: Proxy | None = None  #: while it serves in this process
 
     @abstractmethod
     def start(self) -> None:
@@ -129,7 +130,6 @@ class SharedVehicle(HostedVehicle):
         self._overview = overview
         self._make = make
         self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
-        self.proxy: Proxy | None = None
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping

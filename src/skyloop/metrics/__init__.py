@@ -21,28 +21,14 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Metrics that are counters in the proxy. Absent ones are 0, except those of a network that is not served.
-_COUNTERS: Final = {
-    "skyloop_feedback_published_total": "feedback.published",
-    "skyloop_feedback_selected_total": "feedback.selected",
-    "skyloop_feedback_missed_total": "feedback.missed",
-    "skyloop_commands_received_total": "commands.received",
-    "skyloop_commands_applied_total": "commands.applied",
-    "skyloop_commands_clamped_total": "commands.clamped",
-    "skyloop_commands_superseded_total": "commands.superseded",
-    "skyloop_requests_total": "requests.received",
-    "skyloop_requests_refused_total": "requests.refused",
-    "skyloop_packets_malformed_total": "packets.malformed",
-    "skyloop_packets_refused_total": "packets.refused",
-    "skyloop_events_missed_total": "events.missed",
-    "skyloop_driver_errors_total": "driver.errors",
-}
-_NETWORK: Final = {
-    "skyloop_network_dropped_total": "network.dropped",
-    "skyloop_network_refused_total": "network.refused",
-    "skyloop_network_strays_total": "network.strays",
-    "skyloop_network_turned_away_total": "network.turned_away",
-}
+#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent ones are 0, except those of
+#: a network that is not served.
+_COUNTERS: Final = (
+    *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
+    *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
+    *("events.missed", "driver.errors"),
+)
+_NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
 #: Counters whose name contains a label: the parts of the name before and after it.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
@@ -113,11 +99,9 @@ def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
         yield Reading("skyloop_command_age_seconds", (now_ns - authority.last_command_ns) / NS_PER_S, own)
     counts = proxy.statistics()
     yield Reading("skyloop_applications", counts["applications"], own)
-    for metric, counter in _COUNTERS.items():
-        yield Reading(metric, counts.get(counter, 0.0), own)
-    for metric, counter in _NETWORK.items():
-        if counter in counts:
-            yield Reading(metric, counts[counter], own)
+    yield Reading("skyloop_requests_total", counts.get("requests.received", 0.0), own)
+    for counter in (*_COUNTERS, *(counter for counter in _NETWORK if counter in counts)):
+        yield Reading(f"skyloop_{counter.replace('.', '_')}_total", counts.get(counter, 0.0), own)
     for metric, (prefix, suffix) in _LABELLED.items():
         for counter, count in counts.items():
             label = counter.removeprefix(prefix).removesuffix(suffix)

@@ -176,7 +176,6 @@ class Endpoint:
 
     @property
     def port(self) -> int:
-        """The TCP port."""
         return int(self._server.server_address[1])
 
     @property

@@ -139,7 +139,6 @@ class Tokens:
         return True
 
     def discard(self, who: str, connection: str) -> None:
-        """Remove a token."""
         seen = self._seen.get(who)
         if seen is not None:
             seen.discard(connection)
@@ -147,7 +146,6 @@ class Tokens:
                 del self._seen[who]
 
     def has(self, who: str, connection: str) -> bool:
-        """Return whether there is a token for a connection."""
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:

@@ -259,7 +259,6 @@ class FabricClient(TransportClient):
         self._thread.start()
 
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
-        """Find the proxy and join it."""
         session, name = self._session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone, known)
         self._held.append(watch.declare())

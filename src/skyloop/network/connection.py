@@ -134,7 +134,6 @@ class Sender:
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:

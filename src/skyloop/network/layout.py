@@ -67,7 +67,6 @@ class Sender(NamedTuple):
 
 
 def new_id() -> str:
-    """Return a new random ID or RUN."""
     return secrets.token_hex(8)
 
 

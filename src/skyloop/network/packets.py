@@ -124,17 +124,14 @@ def is_own(packet: bytes) -> bool:
 
 
 def subscribe(topic: str, on: bool) -> bytes:
-    """Encode a :class:`Subscribe`."""
     return _packet(FabricKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def taken(topic: str, number: int) -> bytes:
-    """Encode a :class:`Taken`."""
     return _packet(FabricKind.TAKEN, _NUMBER.pack(number) + topic.encode())
 
 
 def seen(topic: str, number: int) -> bytes:
-    """Encode a :class:`Seen`."""
     return _packet(FabricKind.SEEN, _NUMBER.pack(number) + topic.encode())
 
 

@@ -207,7 +207,6 @@ class FabricServer(TransportServer):
             query.reply(layout.info(self._name), packets.encode_own(about))
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet from an application."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
             connection = self._registry.of_sender(sender)

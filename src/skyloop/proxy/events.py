@@ -85,7 +85,6 @@ class EventPublisher:
         app: str | None = None,
         data: dict[str, Value] | None = None,
     ) -> None:
-        """Publish one event."""
         with self._lock:
             self._send([EventDraft(kind, text, severity, app, data or {})])
 

@@ -242,7 +242,6 @@ class FlightRecord:
         return LIFE_S - max(0.0, age_s) if believed else 0.0
 
     def start(self) -> None:
-        """Start writing."""
         self._thread = threading.Thread(target=self._run, name="skyloop-flight-record", daemon=True)
         self._thread.start()
 

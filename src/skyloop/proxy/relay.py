@@ -272,7 +272,6 @@ class WorkerRoster:
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        """Add or renew a worker."""
         self._workers[app_id, asked.processor] = Worker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:

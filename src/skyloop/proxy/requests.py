@@ -130,15 +130,12 @@ class JobThread:
         self._thread = threading.Thread(target=self._run, name="skyloop-requests", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def put(self, job: Callable[[], None]) -> None:
-        """Queue a job."""
         self._jobs.put(job)
 
     def stop(self, timeout_s: float) -> None:
-        """End after the current job."""
         self._jobs.put(None)
         self._thread.join(timeout_s)
 
@@ -181,7 +178,6 @@ class RequestDispatcher:
         self._pending_lock = threading.Lock()
 
     def start(self) -> None:
-        """Start answering deferred requests."""
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:

@@ -360,7 +360,6 @@ class Streams(Forms[StreamForm]):
             self._counts[f"streams.{camera}.missed"] += missed
 
     def end(self) -> None:
-        """End all threads."""
         for form in self.known:
             form.end()
 

@@ -11,7 +11,7 @@ import itertools
 import logging
 import threading
 from collections import deque
-from enum import Enum, auto
+from collections.abc import Callable
 from queue import SimpleQueue
 
 import numpy as np
@@ -43,16 +43,8 @@ _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-class _What(Enum):
-    """What happened to a client, as reported to the server's receiving thread."""
-
-    JOINED = auto()
-    PACKET = auto()
-    MALFORMED = auto()
-    LEFT = auto()
-
-
-_Item = tuple["MemoryClient", _What, str]  # the text describes a malformed request
+#: A client, and what its server's receiving thread has to tell the handler.
+_Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
 class MemoryServer(TransportServer):
@@ -75,7 +67,7 @@ class MemoryServer(TransportServer):
                 raise LinkError(f"{self.address} has no server: start the transport server first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
-            self._inbox.put((client, _What.JOINED, ""))
+            self._inbox.put((client, lambda handler: handler.peer_joined(client.peer)))
         client.begin()
         return client
 
@@ -131,7 +123,7 @@ class MemoryServer(TransportServer):
 
     def arrived(self, client: MemoryClient) -> None:
         """Wake the receiving thread for a packet in the client's ``outgoing``."""
-        self._inbox.put((client, _What.PACKET, ""))
+        self._inbox.put((client, client.pass_on))
 
     def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
         """Return whether a client may subscribe to a topic; if not, call the handler's ``malformed``."""
@@ -139,7 +131,7 @@ class MemoryServer(TransportServer):
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
         if problem:
-            self._inbox.put((client, _What.MALFORMED, problem))
+            self._inbox.put((client, lambda handler: client.muted or handler.malformed(client.peer, problem)))
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
@@ -149,26 +141,16 @@ class MemoryServer(TransportServer):
                 return
             client.muted = muted
             client.end(reason)
-            self._inbox.put((client, _What.LEFT, ""))
+            self._inbox.put((client, lambda handler: handler.peer_left(client.peer, client.reason)))
 
     def _subscribed(self, topic: str) -> list[MemoryClient]:
         return [client for client in list(self._clients.values()) if topic in client.topics]
 
     def _receive(self, handler: ServerHandler, inbox: SimpleQueue[_Item | None]) -> None:
         while (item := inbox.get()) is not None:
-            client, what, text = item
+            client, tell = item
             try:
-                if what is _What.PACKET:
-                    packet = client.outgoing.popleft()
-                    if not client.muted:
-                        handler.packet(client.peer, packet)
-                elif what is _What.MALFORMED:
-                    if not client.muted:
-                        handler.malformed(client.peer, text)
-                elif what is _What.JOINED:
-                    handler.peer_joined(client.peer)
-                else:
-                    handler.peer_left(client.peer, client.reason)
+                tell(handler)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
                 _log.exception("the server's handler failed; the connection to %s ends", client.peer.address)
                 self.end(client, f"the server's handler failed: {error!r}", muted=True)
@@ -199,6 +181,12 @@ class MemoryClient(TransportClient):
     def begin(self) -> None:
         """Start the receiving thread."""
         self._thread.start()
+
+    def pass_on(self, handler: ServerHandler) -> None:
+        """Give the server's handler the next outgoing packet."""
+        packet = self.outgoing.popleft()
+        if not self.muted:
+            handler.packet(self.peer, packet)
 
     def send(self, packet: bytes) -> bool:
         check_packet(packet)

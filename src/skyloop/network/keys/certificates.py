@@ -53,7 +53,6 @@ class Authority:
 
     @property
     def name(self) -> str:
-        """The authority's name, for users."""
         return common_name(self.certificate)
 
     @property
@@ -203,7 +202,6 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
-    """Return the identity in a certificate."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         (urn,) = (uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_URN))
@@ -222,12 +220,10 @@ def common_name(certificate: x509.Certificate) -> str:
 
 
 def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
-    """Return whether a certificate belongs to this key."""
     return key.public_key() == certificate.public_key()
 
 
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
-    """Check that an authority issued a certificate."""
     try:
         certificate.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature):
@@ -237,7 +233,6 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
-    """Check that a certificate is currently valid."""
     if now >= certificate.not_valid_after_utc:
         raise UsageError(f"{what} expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: issue a new one")
     if now < certificate.not_valid_before_utc:

@@ -68,7 +68,6 @@ class Entry(msgspec.Struct, frozen=True):
 
     @property
     def identity(self) -> Identity:
-        """The identity described by the entry."""
         return Identity(self.name, self.role, self.drones)
 
     @property
@@ -154,32 +153,26 @@ class Credentials:
 
     @property
     def name(self) -> str:
-        """The identity's name."""
         return self.identity.name
 
     @property
     def role(self) -> KeyRole:
-        """The identity's role."""
         return self.identity.role
 
     @property
     def authority_file(self) -> Path:
-        """Path of the lab authority's certificate."""
         return self.directory / AUTHORITY_FILE
 
     @property
     def certificate_file(self) -> Path:
-        """Path of the identity's certificate."""
         return self.directory / CERTIFICATE_FILE
 
     @property
     def key_file(self) -> Path:
-        """Path of the identity's private key."""
         return self.directory / KEY_FILE
 
     @property
     def roster_file(self) -> Path:
-        """Path of the roster."""
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:

@@ -82,12 +82,10 @@ class Identity:
             raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
 
     def require_router(self) -> None:
-        """Check that this is a router."""
         if self.role is not KeyRole.ROUTER:
             raise UsageError(f"these are the keys of {self}: a router needs keys of --role router")
 
     def require_application(self) -> None:
-        """Check that this is a pilot or an observer."""
         if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
             raise UsageError(f"these are the keys of {self}: an application needs a pilot's or an observer's")
 

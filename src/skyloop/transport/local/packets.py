@@ -104,17 +104,14 @@ def hello() -> bytes:
 
 
 def subscribe(topic: str, on: bool) -> bytes:
-    """Encode a :class:`Subscribe`."""
     return _packet(LocalKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def release(slot: int) -> bytes:
-    """Encode a :class:`Release`."""
     return _packet(LocalKind.RELEASE, _NUMBER.pack(slot))
 
 
 def slot(number: int, camera: int, capacity: int) -> bytes:
-    """Encode a :class:`Slot`."""
     return _packet(LocalKind.SLOT, _SLOT.pack(number, camera, capacity))
 
 
@@ -124,7 +121,6 @@ def frame(number: int, header: bytes) -> bytes:
 
 
 def retire(camera: int, before: int) -> bytes:
-    """Encode a :class:`Retire`."""
     return _packet(LocalKind.RETIRE, _RETIRE.pack(camera, before))
 
 
