@@ -17,9 +17,9 @@ from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
 from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Severity, Value, encode
 from skyloop.proxy.core import authority
+from skyloop.proxy.core.airspace import Clamp
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
-from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
 

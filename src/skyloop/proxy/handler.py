@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import msgspec
@@ -38,10 +39,11 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.fields import LATEST_NS
+from skyloop.proxy.core.airspace import AirspaceSettings
+from skyloop.proxy.core.autopilot import AutopilotSettings, ReturnSettings
 from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
-from skyloop.proxy.core.failsafe import REASONS
+from skyloop.proxy.core.failsafe import REASONS, FailsafeSettings
 from skyloop.proxy.core.flight import Snapshot, Whose
-from skyloop.proxy.core.settings import FlightSettings
 from skyloop.proxy.events import EventDraft, emergency_event, name_of, refused_event, taken_event, thin_zones_event
 from skyloop.proxy.requests import Session
 from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
@@ -50,6 +52,19 @@ from skyloop.transport.base import COMMANDS
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
 #: Echo of a command without a new effect, because it was refused or held.
 _NOTHING: Final = Idle()
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSettings:
+    """All settings that follow from parameters."""
+
+    airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
+    failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
+    autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
+    returns: ReturnSettings = field(default_factory=ReturnSettings)
+    max_age_ns: int = 0  #: maximum age of a command [ns]
+    authority_timeout_ns: int = 0
+    authority_ask_ns: int = 0
 
 
 class CommandHandler(FlightSupervisor):

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
 
-from skyloop.clock import NS_PER_S, Clock, seconds
+from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.drivers.base import Driver
 from skyloop.errors import DriverError, ParameterError, UnknownNameError
 from skyloop.messages import (
@@ -34,12 +35,14 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import MAX_BODY
 from skyloop.messages.parameter import CHECKUP, encode_checkup
-from skyloop.proxy.core.settings import FlightSettings
+from skyloop.proxy.core.airspace import AirspaceSettings, Limits
+from skyloop.proxy.core.autopilot import AutopilotSettings, ReturnSettings
+from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.events import EventPublisher
-from skyloop.proxy.handler import CommandHandler
+from skyloop.proxy.handler import CommandHandler, FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.requests import Session
-from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written
+from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
 MAX_TEXT: Final = 1024  #: characters in a text value
 MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
@@ -206,6 +209,55 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
     return checked
 
 
+def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
+    """Return the settings with new values; parts without changed parameters stay the same object.
+
+    ``value``: the effective values by name; ``changed``: prefixes of the changed names, such as ``limits``. Raises
+    :class:`ParameterError` if the no-fly zones can't be parsed.
+    """
+    new: dict[str, Any] = {}
+    limits, space = before.airspace.limits, before.airspace.space
+    if "limits" in changed:
+        limits = Limits(
+            tilt=value["limits.tilt"],
+            climb=value["limits.climb"],
+            yaw_rate=value["limits.yaw_rate"],
+            speed=value["limits.speed"],
+            altitude=value["limits.altitude"],
+        )
+    if "safety" in changed:
+        space = space_of(value.__getitem__, value.__getitem__)
+    if not {"limits", "safety"}.isdisjoint(changed):
+        new["airspace"] = AirspaceSettings(limits, space, value["safety.deceleration"], value["safety.reaction_s"])
+    if not {"limits", "autopilot"}.isdisjoint(changed):
+        new["autopilot"] = AutopilotSettings(
+            takeoff_altitude=min(value["autopilot.takeoff_altitude"], limits.altitude),
+            climb=min(value["autopilot.climb"], limits.climb),
+            descent=min(value["autopilot.descent"], limits.climb),
+            velocity_p=value["autopilot.velocity_p"],
+            velocity_i=value["autopilot.velocity_i"],
+            tilt=limits.tilt,
+        )
+    if not {"failsafe", "battery"}.isdisjoint(changed):
+        new["failsafe"] = FailsafeSettings(
+            hover_after_s=value["failsafe.hover_after_s"],
+            land_after_s=value["failsafe.land_after_s"],
+            retry_s=value["failsafe.retry_s"],
+            battery_warn=value["battery.warn"],
+            battery_land=value["battery.land"],
+            battery_return=value["battery.return"],
+            returns=value["failsafe.return"],
+        )
+    if "return" in changed:
+        new["returns"] = ReturnSettings(value["return.height"], value["return.speed"], value["return.land"])
+    if "command" in changed:
+        new["max_age_ns"] = nanoseconds(value["command.max_age_s"])
+    if "authority" in changed:
+        new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
+        new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
+    return replace(before, **new) if new else before
+
+
 class Parameters:
     """The store. Thread-safe; it calls the driver on the caller's thread, outside its lock."""
 
@@ -295,7 +347,7 @@ class Parameters:
         Raises :class:`ParameterError` if the driver's no-fly zones can't be parsed.
         """
         with self._lock:
-            self._settings = self._settings.updated(self._in_force, self._changed)
+            self._settings = updated_settings(self._settings, self._in_force, self._changed)
             self._changed = set()
             return self._settings
 

@@ -31,13 +31,13 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
+from skyloop.proxy.core.airspace import Clamp
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.command_checks import CommandChecks, Intent
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Snapshot, Whose
-from skyloop.proxy.core.settings import Clamp
 from skyloop.proxy.events import (
     UNHEARD,
     Counters,
