@@ -325,10 +325,7 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Send a request to a host and return its answer, or raise the host's error.
-
-    Otherwise raises :class:`LinkError` if the host can't be reached or ends meanwhile, and :class:`NoAnswerError`.
-    """
+    """Send a request to a host; return its answer or raise its error, :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:
         directory.check()

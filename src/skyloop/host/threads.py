@@ -126,10 +126,7 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads for the job queues of proxies, with one thread per concurrent request.
-
-    A job that hangs delays only its own queue.
-    """
+    """A pool of daemon threads for the proxies' job queues: a job that hangs delays only its own queue."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

@@ -92,10 +92,7 @@ class Outgoing:
         return found
 
     def taken(self, number: int, now_s: float) -> None:
-        """Remove the packets up to this number, which the other end has acknowledged.
-
-        A number that has not been sent yet is ignored.
-        """
+        """Remove the packets acknowledged up to this number; ignore a number that has not been sent yet."""
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
         while self._under_way and self._kept[0].number <= number:
@@ -227,10 +224,7 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet that is resent until acknowledged; return the number up to which all were accepted.
-
-        Without room for another packet, it is ignored and will be resent.
-        """
+        """Receive a packet, to be resent if there is no room; return the number up to which all were accepted."""
         with self._lock:
             if has_room():
                 for each in self._incoming.take(number, packet):

@@ -207,10 +207,7 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no room for another connection of this identity.
-
-        Without keys, only the total number is limited.
-        """
+        """Return why there is no room for another connection; without keys, only the total number is limited."""
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
             return f"fabric:{self._name} already has its maximum of {MAX_CLIENTS} connections" if full else ""

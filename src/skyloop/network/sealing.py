@@ -61,10 +61,7 @@ class Seal:
         self._numbers = itertools.count(1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal a packet that is sent by the key ``where``; return the payload and the attachment to send. Any thread.
-
-        The attachment is authenticated but not encrypted.
-        """
+        """Return payload and attachment of a packet sent by the key ``where``; the attachment is only authenticated."""
         trailer = _TRAILER.pack(self.generation, next(self._numbers))
         attachment += trailer
         return self._cipher.encrypt(trailer, data, _bound(where, attachment)), attachment

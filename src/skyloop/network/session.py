@@ -48,10 +48,7 @@ class Session:
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """Wrap a function that Zenoh calls on its receiving thread for each sample, reply or query.
-
-        The function must return quickly.
-        """
+        """Wrap a function that Zenoh calls on its thread for each sample, reply or query; it must return quickly."""
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
@@ -79,10 +76,7 @@ class Session:
             return set()
 
     def shut_out(self) -> frozenset[str]:
-        """Return the linked nodes that the newest roster excludes.
-
-        Zenoh itself still applies the roster with which the session started.
-        """
+        """Return the linked nodes that the newest roster excludes; Zenoh still applies the one from its start."""
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
@@ -119,10 +113,7 @@ def reason_of(error: BaseException) -> str:
 
 
 class _Pool:
-    """All of this process's sessions.
-
-    A thread closes unused sessions, and ends when there are none.
-    """
+    """All of this process's sessions. A thread closes unused ones, and ends when there are none."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

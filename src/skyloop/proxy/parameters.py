@@ -189,10 +189,7 @@ def _number(parameter: Parameter, number: float) -> float:
 
 
 def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return checked values for the proxy's own parameters.
-
-    Raises :class:`UnknownNameError` for other names, and :class:`ParameterError` for invalid values.
-    """
+    """Return checked values for the proxy's own parameters; :class:`UnknownNameError` for any other name."""
     own = {parameter.name: parameter for parameter in OWN}
     checked: dict[str, Value] = {}
 
@@ -279,12 +276,7 @@ class Parameters:
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Set values for the proxy's own parameters before it starts.
-
-        If the vehicle has a parameter with the same name, :meth:`write_presets` writes to it.
-
-        Raises :class:`UnknownNameError` and :class:`ParameterError`.
-        """
+        """Set values for the proxy's own parameters before it starts; :meth:`write_presets` writes the vehicle's."""
         for name, value in check_presets(values).items():
             self._own[name] = msgspec.structs.replace(self._own[name], value=value)
             self._presets[name] = value
@@ -342,20 +334,14 @@ class Parameters:
                 self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return the flight settings that follow from the effective values.
-
-        Raises :class:`ParameterError` if the driver's no-fly zones can't be parsed.
-        """
+        """Return the flight settings that follow from the effective values; see :func:`updated_settings`."""
         with self._lock:
             self._settings = updated_settings(self._settings, self._in_force, self._changed)
             self._changed = set()
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`.
-
-        Raises :class:`UnknownNameError`, :class:`ParameterError`, and the driver's errors.
-        """
+        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`."""
         parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:

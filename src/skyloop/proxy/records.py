@@ -123,10 +123,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """Read a file; return its entries and the number of unreadable lines (for example, cut off by a crash).
-
-    Raises :class:`UsageError` for an unreadable file.
-    """
+    """Return a file's entries and the number of unreadable lines (for example, cut off by a crash)."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
@@ -228,10 +225,7 @@ class FlightRecord:
         self._thread: threading.Thread | None = None
 
     def left_s(self) -> float:
-        """Return for how much longer the flight of an earlier run may turn up [s]; 0 if there is none.
-
-        Call before :meth:`start`.
-        """
+        """Return for how much longer an earlier run's flight may turn up [s]; 0: none. Call before :meth:`start`."""
         try:
             age_s = self._wall() - self.path.stat().st_mtime
             with self.path.open(encoding="utf-8") as file:

@@ -190,10 +190,7 @@ def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail.
-
-    Raises :class:`UsageError` if a requested file can't be written; the default file is optional.
-    """
+    """Give a proxy its audit trail; :class:`UsageError` if a requested file can't be written, unlike the default."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))

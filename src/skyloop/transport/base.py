@@ -74,10 +74,7 @@ NOBODY = Peer(0, "an unknown application")
 
 
 class ServerHandler(Protocol):
-    """The callbacks of a transport server.
-
-    Except for :meth:`topic_problem` they run on the transport's receiving threads, one call at a time.
-    """
+    """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
         """Handle a new connection, before its first packet. An equal peer identifies it in all later calls."""
@@ -86,10 +83,7 @@ class ServerHandler(Protocol):
         """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle the refusal of a packet that the sender's keys do not allow, and that is not delivered.
-
-        ``peer`` is :data:`NOBODY` if the connection is unknown; ``reason`` is readable text.
-        """
+        """Handle a packet that was not delivered because the sender's keys forbid it; :data:`NOBODY`: unknown."""
 
     def topic_problem(self, topic: str) -> str:
         """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.
@@ -101,17 +95,11 @@ class ServerHandler(Protocol):
         """Handle a request for an unknown topic, or for more topics than allowed; ``reason`` is readable text."""
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """Handle the end of a connection, for a readable reason.
-
-        Called once for each ``peer_joined``, after the connection's last packet.
-        """
+        """Handle the end of a connection and its reason, once for each ``peer_joined``, after the last packet."""
 
 
 class TransportServer(ABC):
-    """A proxy's side of a transport.
-
-    Between :meth:`start` and :meth:`stop` all methods may be called from any thread.
-    """
+    """A proxy's side of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
@@ -172,10 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """The callbacks of a transport client.
-
-    They run on the transport's receiving thread, one call at a time.
-    """
+    """A transport client's callbacks: on its receiving thread, one call at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -208,10 +193,7 @@ class TransportClient(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection. Idempotent.
-
-        The handler's ``closed`` runs before this returns, except on the receiving thread.
-        """
+        """End the connection. Idempotent. ``closed`` runs before this returns, except on the receiving thread."""
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
         """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.

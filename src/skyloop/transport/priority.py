@@ -159,10 +159,7 @@ class PriorityLock:
         woken.acquire()  # the releaser has made this thread the owner
 
     def release(self, *_: object) -> None:
-        """Release the lock once; the last release hands it over.
-
-        Only the owning thread may call this; that is not checked.
-        """
+        """Release the lock once, as its owner (not checked); the last release hands it over."""
         if self._depth:
             self._depth -= 1
             return

@@ -139,10 +139,7 @@ class Joined:
 
 
 def resources() -> tuple[int, int]:
-    """Return the number of threads and, where ``/proc`` shows it, open descriptors of this process.
-
-    The garbage collector runs first.
-    """
+    """Return the number of threads and, from ``/proc``, open descriptors of this process, after collecting garbage."""
     gc.collect()
     descriptors = Path("/proc/self/fd")
     return threading.active_count(), len(list(descriptors.iterdir())) if descriptors.exists() else 0

@@ -61,7 +61,7 @@ class Authority:
         return self.certificate.not_valid_after_utc
 
     def sign(self, content: bytes) -> bytes:
-        """Return a signature of content that is not a certificate; needs the key."""
+        """Return a signature of content that is not a certificate."""
         assert self.key is not None
         return self.key.sign(content, _SIGNED)
 

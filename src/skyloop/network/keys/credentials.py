@@ -95,10 +95,7 @@ class Roster(msgspec.Struct, frozen=True):
 
     @property
     def identities(self) -> list[Identity]:
-        """The identities that may join: all that have not been revoked.
-
-        Whether their certificates are valid is checked in the handshake.
-        """
+        """The identities that may join: all not revoked. The handshake checks whether their certificates are valid."""
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
@@ -309,10 +306,7 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a directory against changes by other processes; wait while one of them holds the lock.
-
-    The kernel releases the lock when the process ends.
-    """
+    """Lock a directory against changes by other processes; wait for the lock, which ends with its process."""
     try:
         import fcntl
     except ImportError:

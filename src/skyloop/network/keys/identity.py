@@ -180,10 +180,7 @@ def may_publish(identity: Identity) -> Rules:
 
 
 def may_subscribe(identity: Identity) -> Rules:
-    """Return what an identity may receive.
-
-    Applications receive what proxies send to them; proxies receive what applications send.
-    """
+    """Return what an identity may receive: applications what proxies send to them, and vice versa."""
     if identity.role is KeyRole.ROUTER:
         return may_publish(identity)
     names, alive, info = _chunks(identity.drones), layout.alive(_ANY, _ANY), layout.info(_ANY)

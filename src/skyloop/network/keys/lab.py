@@ -102,10 +102,7 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster currently in the folder.
-
-        Raises :class:`UsageError` if it can't be read or was modified.
-        """
+        """The roster in the folder; :class:`UsageError` if it can't be read or was modified."""
         path = self.directory / ROSTER_FILE
         return decode_roster(read(path, "the roster"), self.authority, path)
 
@@ -114,10 +111,7 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create a new key and certificate for an identity, or renew them, valid no longer than the authority.
-
-        A revoked name is refused until its lost key is no longer valid.
-        """
+        """Create or renew an identity's key and certificate; a revoked name only after its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
@@ -141,10 +135,7 @@ class Lab:
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Revoke an identity and delete the files in its folder here.
-
-        The revocation takes effect wherever the new roster is installed.
-        """
+        """Revoke an identity, wherever the new roster is installed, and delete the files in its folder here."""
         with locked(self.directory):
             roster = self.roster
             entry = roster.find(name)
@@ -159,10 +150,7 @@ class Lab:
         return revoked
 
     def _write_roster(self, roster: Roster) -> None:
-        """Write the roster to the lab's folder and to those of all identities.
-
-        Every folder copied from now on therefore has the newest one.
-        """
+        """Write the roster to the folders of the lab and all identities, so that every copy has the newest one."""
         content = encode_roster(roster, self.authority)
         write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:

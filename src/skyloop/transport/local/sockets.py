@@ -95,10 +95,7 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long the kernel blocks in a call [s], which then fails with ``EAGAIN``; 0: no limit.
-
-    ``option``: ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``.
-    """
+    """Limit how long calls block [s], by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; after that, ``EAGAIN``; 0: no limit."""
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
@@ -164,10 +161,7 @@ class ServerConnection:
         self._socket.sendmsg((packet,), (rights,), SEND_FLAGS)
 
     def hang_up(self, reason: str) -> None:
-        """End the connection and send the reason to the application. Any thread.
-
-        To the receiving thread, this is like any other end.
-        """
+        """End the connection with a reason. Any thread. To the receiving thread, this is like any other end."""
         if not self.ending:
             self.reason = self.reason or reason
             self.ending = True
