@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.clock import NS_PER_S
 from skyloop.extend import Known
 from skyloop.messages import Failsafe, FlightState, LinkState
-from skyloop.metrics.endpoint import FAMILIES, Endpoint, Family, Reading, Source, serve
+from skyloop.metrics.endpoint import FAMILIES, Endpoint, Reading, Source, serve
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -38,21 +38,7 @@ _LABELLED: Final = {
     "skyloop_frames_missed_total": ("frames.", ".missed"),
 }
 _DELAYS: Final = {"median": "commands.delay.median_s", "p99": "commands.delay.p99_s", "max": "commands.delay.max_s"}
-
-
-__all__ = [
-    "FAMILIES",
-    "Endpoint",
-    "Family",
-    "Reading",
-    "Source",
-    "client_readings",
-    "proxy_readings",
-    "router_readings",
-    "serve",
-    "serve_proxies",
-    "serving_beside",
-]
+__all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # what is passed on from the endpoint
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:

@@ -30,18 +30,8 @@ import msgspec
 
 from skyloop.errors import FileFormatError, UnsupportedError, UsageError
 from skyloop.files import expand, read_bytes
-from skyloop.network.keys.certificates import (
-    Authority,
-    Certificate,
-    PrivateKey,
-    check_issued,
-    check_time,
-    identity_of,
-    matches,
-    read_authority,
-    read_certificate,
-    read_key,
-)
+from skyloop.network.keys import certificates
+from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
@@ -190,15 +180,15 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     path = expand(directory).resolve()
     _check_folder(path)
     certificate_path, key_path = path / CERTIFICATE_FILE, path / KEY_FILE
-    key = read_key(read_private(key_path, "the private key"), key_path)
-    certificate = read_certificate(read(certificate_path, "the certificate"), certificate_path)
+    key = certificates.read_key(read_private(key_path, "the private key"), key_path)
+    certificate = certificates.read_certificate(read(certificate_path, "the certificate"), certificate_path)
     authority = _read_authority(path)
-    if not matches(key, certificate):
+    if not certificates.matches(key, certificate):
         raise UsageError(f"{key_path} does not belong to the certificate {certificate_path}: copy both from one folder")
-    check_issued(certificate, authority, certificate_path)
-    check_time(authority.certificate, f"the lab's authority, {path / AUTHORITY_FILE},", now)
-    check_time(certificate, f"the key {path}", now)
-    identity = identity_of(certificate, certificate_path)
+    certificates.check_issued(certificate, authority, certificate_path)
+    certificates.check_time(authority.certificate, f"the lab's authority, {path / AUTHORITY_FILE},", now)
+    certificates.check_time(certificate, f"the key {path}", now)
+    identity = certificates.identity_of(certificate, certificate_path)
     roster = _read_roster(path, authority)
     _check_listed(identity, roster, path)
     return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path, certificate, key)
@@ -227,7 +217,9 @@ def expiry_warning(what: str, end: datetime, now: datetime) -> str:
 
 def _read_authority(directory: Path) -> Authority:
     path = directory / AUTHORITY_FILE
-    return read_authority(read_certificate(read(path, "the authority's certificate"), path), None, path)
+    return certificates.read_authority(
+        certificates.read_certificate(read(path, "the authority's certificate"), path), None, path
+    )
 
 
 def _read_roster(directory: Path, authority: Authority) -> Roster:

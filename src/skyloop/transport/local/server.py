@@ -107,7 +107,8 @@ class LocalServer(TransportServer):
             thread.join()  # a handler that stops its own server must not wait for itself
 
     def send(self, peer: Peer, packet: bytes) -> bool:
-        check_packet(packet)
+        if not 0 < len(packet) <= MAX_PACKET:
+            check_packet(packet)
         connection = self._peers.get(peer.id)
         if connection is None:
             return False
@@ -268,13 +269,14 @@ class LocalServer(TransportServer):
                 continue  # handled at once, because a command behind it must not have to wait for it
             lock.acquire(is_command(packet))
             try:
-                if connection.pilot and poll(0):  # it had to wait, so packets that have arrived since may supersede it
+                more = connection.pilot and poll(0)
+                if more:  # it had to wait, so packets that have arrived since may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
             finally:
                 lock.release()
-            while backlog and not reason:
+            while more and backlog and not reason:
                 lock.acquire(backlog.lane is not Lane.OTHERS)
                 try:
                     reason = self._take(handler, connection, self._next(connection))
