@@ -140,26 +140,22 @@ def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> Fab
 
     Log a warning if the key expires within a week. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
-    found = _choose(network, keys)
-    if found is not None and found.ring is not None:
-        for change in found.ring.poll():
-            _log.warning("%s", change)
-    return found
-
-
-def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings | None:
     if isinstance(network, FabricSettings):
-        return network if keys is None else secure(network, keys)
-    requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
-    if isinstance(requested, bool):
-        requested = MULTICAST if requested else ""
-    if requested.strip().lower() in _OFF:
-        if keys is not None and network is None:
-            raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
-        return None
-    words = [word.strip() for word in requested.split(",") if word.strip()]
-    connect = tuple(word for word in words if word.lower() not in _ON)
-    return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+        found = network if keys is None else secure(network, keys)
+    else:
+        requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
+        if isinstance(requested, bool):
+            requested = MULTICAST if requested else ""
+        if requested.strip().lower() in _OFF:
+            if keys is not None and network is None:
+                raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
+            return None
+        words = [word.strip() for word in requested.split(",") if word.strip()]
+        connect = tuple(word for word in words if word.lower() not in _ON)
+        found = settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+    for change in () if found.ring is None else found.ring.poll():
+        _log.warning("%s", change)
+    return found
 
 
 def serving(
@@ -252,6 +248,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
+    usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]  # with keys, nothing is accepted unencrypted
     found: dict[str, Any] = {
         "mode": "router" if part is Part.ROUTER else "peer",
         "listen": {"endpoints": endpoints},
@@ -264,7 +261,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         "transport": {
             "unicast": {"max_links": 2, "open_timeout": OPEN_GIVEN_MS if connect else OPEN_MS},
             "link": {
-                "protocols": _protocols([*endpoints, *connect], settings),
+                "protocols": sorted({*usual, *(each.partition("/")[0] for each in (*endpoints, *connect))}),
                 "tx": {
                     "lease": lease_ms,
                     "keep_alive": KEEP_ALIVES,
@@ -319,7 +316,7 @@ def listening(settings: FabricSettings) -> list[str]:
     """Return the addresses to listen on, with free ports in place of port 0; by default one on all interfaces."""
     addresses = settings.listen or (f"{all_interfaces()}:0",)
     return [
-        f"{address.removesuffix(':0')}:{free_port(_host(address))}"
+        f"{address.removesuffix(':0')}:{free_port(address.rpartition(':')[0].strip('[]'))}"
         if address.endswith(":0") and "/" not in address
         else address
         for address in addresses
@@ -355,12 +352,6 @@ def _called(part: Part, has_addresses: bool) -> list[str]:
     return [] if has_addresses or part is Part.ROUTER else ["router"]
 
 
-def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
-    """Return the accepted protocols: only encrypted ones if there are keys."""
-    usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
-    return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
-
-
 def _tls(settings: FabricSettings) -> dict[str, Any]:
     assert settings.tls is not None
     certificate, key = str(settings.tls.certificate), str(settings.tls.key)
@@ -388,10 +379,6 @@ def _with_port(address: str) -> str:
     if not host or not bare or not port.isdecimal() or int(port) > 65535:
         raise UsageError(f"{address!r} is not a network address, such as 10.0.0.5:7447, [fe80::1]:7447 or lab.local")
     return f"{host}:{port}"
-
-
-def _host(address: str) -> str:
-    return address.rpartition(":")[0].strip("[]")
 
 
 def all_interfaces() -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import msgspec
@@ -215,13 +215,7 @@ def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: 
     new: dict[str, Any] = {}
     limits, space = before.airspace.limits, before.airspace.space
     if "limits" in changed:
-        limits = Limits(
-            tilt=value["limits.tilt"],
-            climb=value["limits.climb"],
-            yaw_rate=value["limits.yaw_rate"],
-            speed=value["limits.speed"],
-            altitude=value["limits.altitude"],
-        )
+        limits = Limits(**{each.name: value[f"limits.{each.name}"] for each in fields(Limits)})
     if "safety" in changed:
         space = space_of(value.__getitem__, value.__getitem__)
     if not {"limits", "safety"}.isdisjoint(changed):

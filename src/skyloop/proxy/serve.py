@@ -177,16 +177,12 @@ def run(
         # Wake periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
-                _publish_keys(proxies, change)
+                _log.warning("%s", change)
+                for proxy in proxies:
+                    proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
             if parent_fd is None:  # a parent gets the proxy's events, and might not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
-
-
-def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
-    _log.warning("%s", change)
-    for proxy in proxies:
-        proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:

@@ -4,19 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_packet
 from skyloop.transport.priority import PriorityLock, is_command
-
-
-class _Member(NamedTuple):
-    """The end that an application is connected to, and its peer there."""
-
-    end: TransportServer
-    peer: Peer
 
 
 class CompositeServer(TransportServer):
@@ -31,7 +23,9 @@ class CompositeServer(TransportServer):
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
         self.lock = PriorityLock()  #: a thread must hold it to call the handler
-        self._members: dict[int, _Member] = {}  # by our number
+        self._members: dict[
+            int, tuple[TransportServer, Peer]
+        ] = {}  # by our number: an application's end and peer there
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
@@ -63,7 +57,8 @@ class CompositeServer(TransportServer):
         if member is None:
             check_packet(packet)
             return False
-        return member.end.send(member.peer, packet)
+        end, theirs = member
+        return end.send(theirs, packet)
 
     def publish(self, topic: str, packet: bytes) -> int:
         return sum(end.publish(topic, packet) for end in self._ends)
@@ -76,12 +71,12 @@ class CompositeServer(TransportServer):
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:
         member = self._members.get(peer.id)
-        return "" if member is None else member.end.admit(member.peer, pilot=pilot)
+        return "" if member is None else member[0].admit(member[1], pilot=pilot)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
         member = self._members.get(peer.id)
         if member is not None:
-            member.end.disconnect(member.peer, reason)
+            member[0].disconnect(member[1], reason)
 
     @property
     def counters(self) -> dict[str, float]:
@@ -103,7 +98,7 @@ class CompositeServer(TransportServer):
         """Give an end's peer a number of this server; return it as the handler knows it. The caller holds the lock."""
         self._last_id += 1
         ours = Peer(self._last_id, peer.address)
-        self._members[ours.id] = _Member(end, peer)
+        self._members[ours.id] = end, peer
         return ours
 
     def leave(self, peer: Peer) -> None:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -129,13 +129,12 @@ def picture(head: FrameHeader) -> Pixels:
     return (np.arange(head.size, dtype=np.uint32) * 7 + head.seq * 31).astype(np.uint8)
 
 
-class Joined:
+class Joined(NamedTuple):
     """A transport client that has joined, its log, and its :class:`Peer` at the server."""
 
-    def __init__(self, client: TransportClient, log: ClientLog, peer: Peer) -> None:
-        self.client = client
-        self.log = log
-        self.peer = peer
+    client: TransportClient
+    log: ClientLog
+    peer: Peer
 
 
 def resources() -> tuple[int, int]:

@@ -125,7 +125,9 @@ class Lab:
                 )
             key = certificates.new_key()
             certificate = certificates.issue(self.authority, identity, key, now + timedelta(days=days), now)
-            entry = _entry(identity, certificate.serial_number, certificate.not_valid_after_utc, before)
+            expires, serial = int(certificate.not_valid_after_utc.timestamp()), f"{certificate.serial_number:x}"
+            last = max(expires, before.last) if before else expires
+            entry = Entry(identity.name, identity.role, identity.drones, serial, expires, last)
             folder = self.folder(identity.name)
             make_directory(folder)
             write(folder / KEY_FILE, certificates.key_pem(key), private=True)
@@ -157,12 +159,6 @@ class Lab:
             folder = self.folder(entry.name)
             if not entry.revoked and folder.is_dir():
                 write(folder / ROSTER_FILE, content)
-
-
-def _entry(identity: Identity, serial: int, end: datetime, before: Entry | None) -> Entry:
-    expires = int(end.timestamp())
-    last = max(expires, before.last) if before else expires
-    return Entry(identity.name, identity.role, identity.drones, f"{serial:x}", expires, last)
 
 
 def _now(now: datetime | None) -> datetime:

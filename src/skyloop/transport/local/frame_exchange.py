@@ -15,6 +15,7 @@ import mmap
 import os
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
@@ -77,18 +78,16 @@ class Connection(Protocol):
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None: ...
 
 
+@dataclass(slots=True, eq=False)
 class Viewer:
     """One client's subscription to one camera."""
 
-    __slots__ = ("active", "announced", "connection", "leases", "retire_before", "waits")
-
-    def __init__(self, connection: Connection) -> None:
-        self.connection = connection
-        self.leases: dict[int, SlotMemory] = {}
-        self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number are retired, and the client must be notified; 0: none
-        self.active = True  #: whether it gets frames; if not, it may still hold some
-        self.waits = False  #: whether it was skipped, and waits for a frame
+    connection: Connection
+    leases: dict[int, SlotMemory] = field(default_factory=dict)
+    announced: set[int] = field(default_factory=set)
+    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
+    active: bool = True  #: whether it gets frames; if not, it may still hold some
+    waits: bool = False  #: whether it was skipped, and waits for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
         """Send a frame, unless the viewer holds enough frames or its socket is full; then mark it as waiting."""

@@ -145,7 +145,10 @@ def parse(packet: bytes) -> Message:
     body = packet[HEADER_SIZE:]
     try:
         if kind == LocalKind.SUBSCRIBE:
-            return _parse_subscribe(body)
+            on, topic = body[0], body[1:].decode()
+            if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
+                raise DecodeError(f"invalid subscription: {len(topic)} characters, flag {on}")
+            return Subscribe(topic, bool(on))
         if kind == LocalKind.BYE:
             return Bye(body[:MAX_REASON].decode(errors="replace"))
         layout, message = _FIXED[kind]
@@ -173,13 +176,6 @@ def parse_frame(packet: bytes) -> Frame:
     if type(header) is not FrameHeader:
         raise DecodeError(f"a frame was announced by a {type(header).__name__} and must be announced by a FrameHeader")
     return Frame(slot, header)
-
-
-def _parse_subscribe(body: bytes) -> Subscribe:
-    on, topic = body[0], body[1:].decode()
-    if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
-        raise DecodeError(f"invalid subscription: {len(topic)} characters, flag {on}")
-    return Subscribe(topic, bool(on))
 
 
 WAKE: Final = _packet(LocalKind.WAKE, b"")
