@@ -10,12 +10,11 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 from skyloop.address import is_loopback
@@ -163,7 +162,7 @@ def parse_where(where: str) -> tuple[str, int]:
     return (host.removeprefix("[").removesuffix("]") if colon else LOOPBACK), int(port)
 
 
-class Endpoint:
+class Endpoint(AbstractContextManager["Endpoint"]):
     """Serves metrics over HTTP. Created by :func:`serve`; a context manager that closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
@@ -196,12 +195,7 @@ class Endpoint:
         self._thread.join()
         self._server.server_close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -221,7 +221,7 @@ class FabricClient(TransportClient):
         list_s: float,
         known: packets.ProxyInfo | None = None,
     ) -> None:
-        self._session = session
+        self.session = session  #: the Zenoh session, which may be shared with other connections
         self.parted = False  #: whether the proxy has announced or accepted the end of this connection
         self._name = name
         self._handler = handler
@@ -259,7 +259,7 @@ class FabricClient(TransportClient):
         self._thread.start()
 
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
-        session, name = self._session, self._name
+        session, name = self.session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone, known)
         self._held.append(watch.declare())
         candidates = watch.find(find_s, list_s)
@@ -305,7 +305,7 @@ class FabricClient(TransportClient):
                 wanted = Subscription(
                     topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
                 )
-                self._subscriptions[topic] = wanted, wanted.declare(self._session, self._name, self._id)
+                self._subscriptions[topic] = wanted, wanted.declare(self.session, self._name, self._id)
             sent = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
             declared: list[Any] = []
             if not on:
@@ -321,11 +321,6 @@ class FabricClient(TransportClient):
             self._thread.join()
 
     @property
-    def session(self) -> Session:
-        """The Zenoh session, which may be shared with other connections."""
-        return self._session
-
-    @property
     def same_clock(self) -> bool:
         return False
 
@@ -335,7 +330,7 @@ class FabricClient(TransportClient):
 
     @property
     def excused_s(self) -> float:
-        return self._session.settings.excused_s
+        return self.session.settings.excused_s
 
     @property
     def address(self) -> str:
@@ -343,12 +338,12 @@ class FabricClient(TransportClient):
 
     def _send_command(self, packet: bytes) -> bool:
         if self._command is None:
-            self._command = self._session.publisher(self._command_key, "REAL_TIME", best_effort=True)
+            self._command = self.session.publisher(self._command_key, "REAL_TIME", best_effort=True)
         return self._send_once(self._command, self._command_key, packet)
 
     def _send_report(self, packet: bytes) -> bool:
         if self._report is None:
-            self._report = self._session.publisher(self._report_key, "DATA_HIGH", best_effort=True)
+            self._report = self.session.publisher(self._report_key, "DATA_HIGH", best_effort=True)
         return self._send_once(self._report, self._report_key, packet)
 
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
@@ -379,7 +374,7 @@ class FabricClient(TransportClient):
         key = layout.upward(way, self._name, self._who, self._id)
         sealed = self._admission.sealer.seal(key, packets.number(number), packet)
         try:
-            self._session.put(key, *sealed, "DATA_HIGH")
+            self.session.put(key, *sealed, "DATA_HIGH")
         except load().ZError as error:
             _log.debug("%s: not sent: %s", self._name, error)
             return False
@@ -456,7 +451,7 @@ class FabricClient(TransportClient):
         self._keys_s = now_s + KEYS_S
         for change in ring.poll():
             _log.warning("%s", change)
-        linked = self._session.shut_out()
+        linked = self.session.shut_out()
         if not ring.admits(proxy):
             reason = f"the keys of the proxy, {proxy}, were revoked or changed"
         elif not ring.admits(ring.credentials.identity):
@@ -467,7 +462,7 @@ class FabricClient(TransportClient):
             reason = f"linked to a node whose keys were revoked or changed: {', '.join(sorted(linked))}"
         else:
             return
-        retire(self._session)  # the next session will use the newer roster
+        retire(self.session)  # the next session will use the newer roster
         self._end(reason)
 
     # --- the end of the connection ---
@@ -509,7 +504,7 @@ class FabricClient(TransportClient):
             with self._lock:
                 self._send_due()
         self._undeclare()
-        release(self._session)
+        release(self.session)
         try:
             self._handler.closed(self._reason)
         except Exception:  # noqa: BLE001  (a handler may raise anything)

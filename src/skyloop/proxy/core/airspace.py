@@ -372,9 +372,8 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        if (
-            not goes_on and action.speed is not None and action.speed > speed
-        ):  # only once, because the direction changes near the target
+        # Only once, because the direction changes near the target.
+        if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
             clamps.append(Clamp("limits.yaw_rate", action.turn_rate, limits.yaw_rate))
