@@ -266,8 +266,7 @@ class Host:
             else:
                 return
             self._loops.append(new)
-        vehicle = self._of(member)
-        if vehicle is not None:
+        if (vehicle := self._of(member)) is not None:
             self.announce(f"vehicle of {vehicle.settings.name}: its driver has been blocking for {_STALL_S:g} s")
             vehicle.report_stall(_STALL_S)
 
@@ -276,13 +275,11 @@ class Host:
         with self._lock:
             self._loops.remove(loop)
         loop.close()  # in case it ever returns
-        vehicle = self._of(member)
-        if vehicle is not None:
+        if (vehicle := self._of(member)) is not None:
             self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
 
     def _on_failing(self, proxy: Proxy, error: BaseException) -> None:
-        vehicle = self._of(proxy)
-        if vehicle is not None:
+        if (vehicle := self._of(proxy)) is not None:
             self._give_up(vehicle, f"its driver fails at every tick, so that no failsafe runs: {error!r}")
 
     def _give_up(self, vehicle: SharedVehicle, reason: str) -> None:

@@ -261,8 +261,7 @@ class ControlServer:
         set_timeout(sock, socket.SO_RCVTIMEO, _SLOW_S)
         set_timeout(sock, socket.SO_SNDTIMEO, _SLOW_S)
         try:
-            answer = self._answer(sock)
-            if answer is not None:
+            if (answer := self._answer(sock)) is not None:
                 _send(sock, msgspec.json.encode(answer))
         except OSError as error:
             _log.info("an answer was not received: %s", error)

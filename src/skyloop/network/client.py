@@ -286,8 +286,7 @@ class FabricClient(TransportClient):
             if self._ended:
                 return False
             if way != layout.ASK and self._observer is not None:
-                answer = layout.refusal_reply(packet, self._observer, self._name)
-                if answer is not None:
+                if (answer := layout.refusal_reply(packet, self._observer, self._name)) is not None:
                     self._inbox.put((None, answer, 0))
                 return answer is not None
             if way == layout.COMMAND:
@@ -529,8 +528,7 @@ class FabricClient(TransportClient):
         if subscription is None:
             self._handler.packet(packet)
             return
-        answer = subscription.deliver(self._handler, packet, number)
-        if answer:
+        if answer := subscription.deliver(self._handler, packet, number):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:

@@ -166,8 +166,7 @@ class FramePublisher:
             return self._problem(key, topic)
 
     def _problem(self, key: Hashable, topic: str) -> str:
-        unknown = self.topic_problem(topic)
-        if unknown:
+        if unknown := self.topic_problem(topic):
             return unknown
         try:
             request = VideoRequest.parse(topic)

@@ -193,8 +193,7 @@ class ConnectionRegistry:
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
-            problem = self._no_place(sender.who)
-            if problem:
+            if problem := self._no_place(sender.who):
                 self._turn_away(f"{address} was not admitted: {problem}")
                 return problem
             self._last_id += 1
@@ -282,8 +281,7 @@ class ConnectionRegistry:
         """Send a packet that must arrive. Return False if the connection has ended or this ends it. Any thread."""
         if connection.ended:
             return False
-        problem = connection.queue(packet)
-        if problem:
+        if problem := connection.queue(packet):
             self.drop(connection, problem)
             return False
         self._sender.wake(connection)

@@ -153,8 +153,7 @@ class FabricServer(TransportServer):
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        connection = self._registry.of_peer(peer)
-        if connection is not None:
+        if (connection := self._registry.of_peer(peer)) is not None:
             self._registry.disconnect(connection, reason)
 
     @property

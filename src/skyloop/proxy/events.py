@@ -138,8 +138,7 @@ class EventPublisher:
             self._counts["events.published"] += 1
             self._counts[f"events.of.{kind.value}"] += 1
         for packet in packets:
-            missed = self._publish(EVENTS, packet)
-            if missed:
+            if missed := self._publish(EVENTS, packet):
                 self._missed += missed
                 self._counts["events.missed"] += missed
 

@@ -471,8 +471,7 @@ class Proxy:
     def _greet(self, session: Session, hello: Hello, now_ns: int) -> AnyReply:
         if session.role is not None:
             return Refused(Refusal.PROTOCOL, "Hello was already sent on this connection")
-        full = self.server.admit(session.peer, pilot=hello.role is Role.PILOT)
-        if full:
+        if full := self.server.admit(session.peer, pilot=hello.role is Role.PILOT):
             return Refused(Refusal.BUSY, full)
         session.name, session.role = hello.name, hello.role
         text = f"{hello.name} connected as {hello.role.value} from {session.peer.address}"

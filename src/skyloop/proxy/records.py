@@ -171,8 +171,7 @@ class AuditTrail:
 
     def note(self, event: Event) -> None:
         """Record an event. Thread-safe."""
-        entry = entry_of(event, self._wall(), self._proxy, self._run)
-        if entry is not None:
+        if (entry := entry_of(event, self._wall(), self._proxy, self._run)) is not None:
             self._queue.put(entry)
 
     def close(self) -> None:

@@ -283,8 +283,7 @@ def _announced(proxy: Proxy) -> LinkLines:
 
 def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
     vehicle = proxy.publisher
-    line = lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns())
-    if line:
+    if line := lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns()):
         _announce(line)
 
 

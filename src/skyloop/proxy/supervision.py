@@ -142,8 +142,7 @@ class FlightSupervisor:
             self._observe_link(now_ns)
             self._observe_silence(now_ns)
             self._observe_position(now_ns)
-            effects = self.authority.update(now_ns)
-            if effects:
+            if effects := self.authority.update(now_ns):
                 self._apply_authority(effects, now_ns)
             self._update_failsafe(now_ns)
             session = self._holder
@@ -404,8 +403,7 @@ class FlightSupervisor:
 
     def _update_failsafe(self, now_ns: int) -> None:
         """Let the ladder decide and act, and publish the results."""
-        drafts = self._act(now_ns)
-        if drafts:
+        if drafts := self._act(now_ns):
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:

@@ -74,8 +74,7 @@ class CompositeServer(TransportServer):
         return "" if member is None else member[0].admit(member[1], pilot=pilot)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        member = self._members.get(peer.id)
-        if member is not None:
+        if (member := self._members.get(peer.id)) is not None:
             member[0].disconnect(member[1], reason)
 
     @property

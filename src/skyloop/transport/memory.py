@@ -113,8 +113,7 @@ class MemoryServer(TransportServer):
         return len(self._subscribed(topic))
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        client = self._clients.get(peer.id)
-        if client is not None:
+        if (client := self._clients.get(peer.id)) is not None:
             self.end(client, reason, muted=True)
 
     @property

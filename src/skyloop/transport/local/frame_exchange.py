@@ -190,8 +190,7 @@ class Camera:
 
     def leave(self, connection: Connection) -> None:
         """Remove a client that is gone, and free all its slots."""
-        viewer = self.viewers.pop(connection, None)
-        if viewer is not None:
+        if (viewer := self.viewers.pop(connection, None)) is not None:
             for slot in viewer.leases.values():
                 self.drop(slot)
             self._trim()
@@ -260,9 +259,7 @@ class FrameExchange:
     def unsubscribe(self, connection: Connection, name: str) -> None:
         """Stop sending a camera's frames to a connection."""
         with self._lock:
-            camera = self._cameras.get(name)
-            viewer = camera.viewers.get(connection) if camera is not None else None
-            if camera is not None and viewer is not None:
+            if (camera := self._cameras.get(name)) and (viewer := camera.viewers.get(connection)):
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:

@@ -148,8 +148,7 @@ class LocalServer(TransportServer):
             return ""
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        connection = self._peers.get(peer.id)
-        if connection is not None:
+        if (connection := self._peers.get(peer.id)) is not None:
             connection.hang_up(reason)
 
     @property
@@ -208,8 +207,7 @@ class LocalServer(TransportServer):
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
             return None
-        problem = self._make_room(who)
-        if problem:
+        if problem := self._make_room(who):
             sock.hang_up(packets.bye(problem))
             return None
         self._last_id += 1
