@@ -87,15 +87,6 @@ class CommandHandler(FlightSupervisor):
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
-    def aged(self, command: Command, now_ns: int) -> Command:
-        """Return a command with its true age; after a sleep of the computer, an old command looks as if just sent."""
-        if self._slept() - self._slept_seen >= SLEEP_NS:
-            with self._lock:
-                self._observe_sleep(now_ns)
-        if command.sent_ns >= self._awake_ns:
-            return command
-        return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
-
     def problem_with_ceiling(self, altitude: float) -> str:
         """Return why ``limits.altitude`` must not be lowered to this height [m] now, as text; empty if it may."""
         with self._lock:
@@ -212,6 +203,12 @@ class CommandHandler(FlightSupervisor):
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and execute it, on the receiving thread."""
+        # Give it its true age: after a sleep of the computer, an old command looks as if just sent.
+        if self._slept() - self._slept_seen >= SLEEP_NS:
+            with self._lock:
+                self._observe_sleep(now_ns)
+        if command.sent_ns < self._awake_ns:
+            command = msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
         with self._lock:
             if type(command.action) is EmergencyStop:
                 applied, applied_ns = self._stop_motors(session, command, now_ns)

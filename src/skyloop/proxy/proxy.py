@@ -173,7 +173,7 @@ class Proxy:
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
-        self._command, self._aged = self.handler.command, self.handler.aged
+        self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
         """Write an audit trail; it is closed when the proxy ends. Call before :meth:`start`."""
@@ -341,7 +341,7 @@ class Proxy:
             return
         kind = type(sample)
         if kind is Command:
-            self._command(session, self._aged(sample, now_ns), now_ns)  # type: ignore[arg-type]
+            self._command(session, sample, now_ns)  # type: ignore[arg-type]
         elif isinstance(sample, Request):
             self._requests.handle(session, sample, now_ns)
         elif isinstance(sample, Annotation):
