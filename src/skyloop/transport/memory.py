@@ -130,7 +130,7 @@ class MemoryServer(TransportServer):
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
         if problem:
-            self._inbox.put((client, lambda handler: client.muted or handler.malformed(client.peer, problem)))
+            self._inbox.put((client, lambda handler: client.report(handler, problem)))
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
@@ -186,6 +186,11 @@ class MemoryClient(TransportClient):
         packet = self.outgoing.popleft()
         if not self.muted:
             handler.packet(self.peer, packet)
+
+    def report(self, handler: ServerHandler, problem: str) -> None:
+        """Tell the server's handler about a malformed request."""
+        if not self.muted:
+            handler.malformed(self.peer, problem)
 
     def send(self, packet: bytes) -> bool:
         check_packet(packet)
