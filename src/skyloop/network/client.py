@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
-from skyloop.messages import FrameHeader
+from skyloop.messages import FrameHeader, Refusal, Refused, Reply, Request, decode, encode
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
 from skyloop.network.config import FabricSettings, Part
@@ -36,6 +36,8 @@ from skyloop.transport.base import (
 
 if TYPE_CHECKING:
     import zenoh
+
+    from skyloop.network.keys import Identity
 
 GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
@@ -286,7 +288,7 @@ class FabricClient(TransportClient):
             if self._ended:
                 return False
             if way != layout.ASK and self._observer is not None:
-                if (answer := layout.refusal_reply(packet, self._observer, self._name)) is not None:
+                if (answer := refusal_reply(packet, self._observer, self._name)) is not None:
                     self._inbox.put((None, answer, 0))
                 return answer is not None
             if way == layout.COMMAND:
@@ -540,3 +542,18 @@ class FabricClient(TransportClient):
                 self._send_report(packet)
             else:
                 self._put(layout.ASK, packet, 0)
+
+
+def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
+    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
+
+    None if the packet is not a request.
+    """
+    try:
+        sample = decode(packet)
+    except DecodeError:
+        return None
+    if not isinstance(sample, Request):
+        return None
+    text = f"these are the keys of {identity}: they give no right to fly or configure {drone!r}"
+    return encode(Reply(sample.id, Refused(Refusal.OBSERVER, text)))

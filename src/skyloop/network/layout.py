@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import secrets
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import quote, unquote
 
 from skyloop.errors import DecodeError, UsageError
@@ -23,9 +23,6 @@ from skyloop.messages import (
     JoinProcessor,
     ListParameters,
     Ping,
-    Refusal,
-    Refused,
-    Reply,
     Request,
     StreamReport,
     VehiclePose,
@@ -34,9 +31,6 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import KINDS
 from skyloop.transport.base import FEEDBACK, NAME
-
-if TYPE_CHECKING:
-    from skyloop.network.keys import Identity
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO if there are no keys
@@ -179,21 +173,6 @@ def way_of(packet: bytes) -> str:
 def is_report(packet: bytes) -> bool:
     """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong if it arrives late."""
     return packet[:6] == _REPORT
-
-
-def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
-
-    None if the packet is not a request.
-    """
-    try:
-        sample = decode(packet)
-    except DecodeError:
-        return None
-    if not isinstance(sample, Request):
-        return None
-    text = f"these are the keys of {identity}: they give no right to fly or configure {drone!r}"
-    return encode(Reply(sample.id, Refused(Refusal.OBSERVER, text)))
 
 
 def allows(way: str, packet: bytes) -> bool:
