@@ -60,7 +60,7 @@ class Session:
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
 
     def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
-        """Declare a publisher of packets that are dropped if the path is congested, or also on the way."""
+        """Declare a publisher; packets are dropped if the path is congested and, by ``best_effort``, never resent."""
         z = load()
         reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
