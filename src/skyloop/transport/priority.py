@@ -143,7 +143,7 @@ class PriorityLock:
         self._others: deque[tuple[threading.Lock, int]] = deque()
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock and acquire it, if ``urgent`` before all others; the owner may acquire it again."""
+        """Wait for the lock, if ``urgent`` before all waiters that are not; the owner may acquire it again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me

@@ -248,7 +248,10 @@ class Airspace:
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point between the walls, what limits it, and whether the position is known."""
+        """Return the nearest set-point between the walls, its limits, and whether the position is known.
+
+        If it is not, the set-point is unchanged.
+        """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
         self.observe(feedback)
