@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 from skyloop.drivers.base import Sink
-from skyloop.host.links import LinkThread
+from skyloop.host.threads import LinkThread
 from skyloop.transport.testing import wait_until
 from tests.host.fleet import Hosting, Vehicle, closing_reason
 

@@ -13,10 +13,9 @@ import pytest
 import zenoh
 
 from skyloop.network import layout
-from skyloop.network.access import EGRESS, INGRESS, access_control
 from skyloop.network.config import FabricSettings, secured
 from skyloop.network.keys import Lab, load
-from skyloop.network.keys.identity import make_identity
+from skyloop.network.keys.identity import EGRESS, INGRESS, access_control, make_identity
 
 LAB = [
     make_identity("jane", "pilot", "alpha*"),

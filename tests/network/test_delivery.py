@@ -17,8 +17,7 @@ from skyloop.network.delivery import (
     Incoming,
     Outgoing,
 )
-from skyloop.network.handler_queue import IN_A_ROW, HandlerQueue
-from skyloop.network.registry import STALLED_S
+from skyloop.network.registry import IN_A_ROW, STALLED_S, HandlerQueue
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -19,8 +19,9 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.network import layout
+from skyloop.network.client import refusal_reply
 from skyloop.network.keys import Identity, KeyRole
-from skyloop.network.layout import ASK, COMMAND, ORDER, refusal_reply, way_of
+from skyloop.network.layout import ASK, COMMAND, ORDER, way_of
 
 OLGA = Identity("olga", KeyRole.OBSERVER)
 HOVER = encode(Command(1, 1, 1, 1, Hover()))

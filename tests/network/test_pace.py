@@ -26,13 +26,12 @@ class Scene:
     def __init__(self) -> None:
         self.now_s = 100.0
         self.sent: list[tuple[str, int]] = []  # key and number
-        declared = SimpleNamespace(declare_publisher=self._declare)
         self.publisher = Publisher("alpha", "1" * 16, PLAIN, lambda: self.now_s)
-        self.publisher.open(cast("Session", SimpleNamespace(zenoh=declared)), lambda _: "")
+        self.publisher.open(cast("Session", SimpleNamespace(publisher=self._declare)), lambda _: "")
         self._subscribers: dict[ServerConnection, tuple[AckPolicy, list[tuple[float, int]]]] = {}
         self.standing: set[ServerConnection] = set()
 
-    def _declare(self, key: str, **_: Any) -> Any:
+    def _declare(self, key: str, _priority: str, **_: Any) -> Any:
         def put(_payload: bytes, *, attachment: bytes) -> None:
             number = packets.parse_published(attachment)[1]
             self.sent.append((key, number))

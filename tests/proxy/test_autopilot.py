@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.geometry import wrap_angle
-from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
-from skyloop.proxy.core.settings import AutopilotSettings
+from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
 
 ATTITUDE = frozenset({"attitude"})
 GRAVITY = 9.81

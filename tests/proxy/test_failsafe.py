@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land
-from skyloop.proxy.core.failsafe import BatteryLow, Effect, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
-from skyloop.proxy.core.settings import FailsafeSettings
+from skyloop.proxy.core.failsafe import (
+    BatteryLow,
+    Effect,
+    FailsafeAction,
+    FailsafeInputs,
+    FailsafeLadder,
+    FailsafeSettings,
+    StepChange,
+)
 
 S = NS_PER_S
 MS = S // 1000

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Velocity
-from skyloop.proxy.core.settings import SLACK_M, Clamp, Limits
+from skyloop.proxy.core.airspace import SLACK_M, Clamp, Limits
 from skyloop.proxy.events import Episodes
 
 LIMITS = Limits(tilt=0.3, climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)

@@ -23,8 +23,7 @@ from skyloop.messages import (
     Severity,
     Velocity,
 )
-from skyloop.proxy.core.airspace import Airspace, Verdict
-from skyloop.proxy.core.settings import AirspaceSettings, Limits
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Limits, Verdict
 from skyloop.zones import Box, Cylinder, Space
 from tests.support.proxy_bench import ALL, App, Bench, write
 

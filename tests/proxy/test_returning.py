@@ -28,9 +28,8 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.proxy.core.airspace import Airspace
-from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, StartPoint
-from skyloop.proxy.core.settings import AirspaceSettings, Limits, ReturnSettings
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Limits
+from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
 from skyloop.zones import Box, Cylinder, Space
 from tests.support.proxy_bench import ALL, App, Bench
 

@@ -27,8 +27,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
-from skyloop.proxy.core.airspace import MARGIN_M, Airspace, Verdict
-from skyloop.proxy.core.settings import AirspaceSettings, Limits
+from skyloop.proxy.core.airspace import MARGIN_M, Airspace, AirspaceSettings, Limits, Verdict
 from skyloop.stepping.rehearsal import Radio, rehearse
 from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, Space, Zone, check_written, parse_zones, space_of
 from tests.support.proxy_bench import ALL, Bench

@@ -19,8 +19,9 @@ def queue_up(turns: PriorityLock, came: list[str], name: str, *, first: bool = F
     """Start a thread that waits for its turn."""
 
     def wait() -> None:
-        with turns.urgent if first else turns:
-            came.append(name)
+        turns.acquire(first)
+        came.append(name)
+        turns.release()
 
     before = turns.waiting
     thread = threading.Thread(target=wait)

@@ -23,8 +23,7 @@ from skyloop.cockpit.telemetry import Json, number, vector
 from skyloop.errors import NoAnswerError, ParameterError
 from skyloop.messages import Position
 from skyloop.messages.parameter import WORLD, WorldGeometry, decode_world
-from skyloop.proxy.core.airspace import Airspace
-from skyloop.proxy.core.settings import AirspaceSettings, Limits
+from skyloop.proxy.core.airspace import Airspace, AirspaceSettings, Limits
 from skyloop.zones import FAR_M, Box, Space, Zone, space_of
 
 if TYPE_CHECKING:

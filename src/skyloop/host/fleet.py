@@ -102,15 +102,7 @@ class Fleet(msgspec.Struct, frozen=True):
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Read a host's vehicle file.
-
-    Key folders in the file are relative to its own folder.
-
-    Raises:
-        UsageError: The file is missing or unreadable.
-        FileFormatError: The file is not TOML, a key is unknown or missing, or a value is invalid; the message says
-            where, and what is allowed.
-    """
+    """Read a host's vehicle file. Key folders in the file are relative to its own folder."""
     path = expand(path)
     try:
         with path.open("rb") as file:
@@ -158,11 +150,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with defaults filled in; ``own`` contains the file's values at ``place``.
-
-    Raises:
-        FileFormatError: A value is invalid.
-    """
+    """Return a vehicle's settings with defaults filled in; ``own`` contains the file's values at ``place``."""
     _checked(place, "name", lambda: check_name(vehicle.name))
     uri = _checked(place, "address", lambda: parse_uri(vehicle.address))
     _checked(place, "address", lambda: driver_class(uri.scheme))

@@ -17,9 +17,17 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNameError, UsageError
 from skyloop.host.fleet import VehicleSettings
-from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.threads import CHECK_S, HANG_CHECKS, STALL_CHECKS, RequestWorkers, SharedLoop, Ticker, Watchdog
+from skyloop.host.threads import (
+    CHECK_S,
+    HANG_CHECKS,
+    STALL_CHECKS,
+    LinkThread,
+    RequestWorkers,
+    SharedLoop,
+    Ticker,
+    Watchdog,
+)
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
@@ -43,9 +51,8 @@ Announce = Callable[[str], None]
 class Host:
     """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
 
-    Args:
-        announce: Called with a line of text for users when a vehicle joins, fails or leaves.
-        make: Creates the driver for an address; used for vehicles in this process.
+    ``announce``: called with a line of text for users when a vehicle joins, fails or leaves. ``make``: creates the
+    driver for an address; used for vehicles in this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
@@ -66,18 +73,12 @@ class Host:
 
     def proxies(self) -> list[Proxy]:
         """Return the proxies currently serving in this process. Any thread."""
-        present = (vehicle.proxy for vehicle in list(self.vehicles.values()) if isinstance(vehicle, SharedVehicle))
-        return [proxy for proxy in present if proxy is not None]
+        return [vehicle.proxy for vehicle in list(self.vehicles.values()) if vehicle.proxy is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
 
     def add(self, settings: VehicleSettings) -> HostedVehicle:
-        """Serve another vehicle.
-
-        Raises:
-            NameTakenError: This host or another running proxy already has the name.
-            SkyloopError: The vehicle can't be served; it is then listed as failed.
-        """
+        """Serve another vehicle. If that is not possible, raise the error, and list the vehicle as failed."""
         network = network_of(settings)
         with self._lock:
             if self._closing:
@@ -102,7 +103,7 @@ class Host:
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
             # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
-            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
+            if vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
 
@@ -133,20 +134,10 @@ class Host:
         return problems
 
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
-        """Land a vehicle, end its proxy and forget it.
+        """Land a vehicle, end its proxy and forget it; return its last status.
 
-        Args:
-            name: The vehicle.
-            land: Whether to land the vehicle even if it flies under a pilot's lease.
-            timeout_s: Time to wait for the landing [s].
-
-        Returns:
-            Its last status.
-
-        Raises:
-            UnknownNameError: There is no vehicle with this name.
-            RefusedError: The vehicle flies under a lease (code ``flown``) or has not landed in time (``flying``). In
-                either case it is not removed.
+        Raises :class:`RefusedError` and does not remove it if it flies under a lease (code ``flown``), unless it is to
+        ``land`` nevertheless, or has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -158,7 +149,7 @@ class Host:
                 f"remove it anyway: skyloop host remove {name} --land",
                 code="flown",
             )
-        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        proxy = vehicle.proxy
         if not self._end(vehicle, timeout_s, "it was removed from its host", unless_flying=True):
             raise RefusedError(
                 f"{name} has not landed within {timeout_s:g} s and is not removed: it keeps landing and accepts no "
@@ -180,7 +171,7 @@ class Host:
         *,
         unless_flying: bool = False,
     ) -> bool:
-        proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
+        proxy = vehicle.proxy
         ended = vehicle.end(within_s, reason, hurry, unless_flying=unless_flying)
         if ended and proxy is not None:
             self._forget(proxy)
@@ -216,23 +207,16 @@ class Host:
 
     def publish_keys(self, change: str) -> None:
         """Publish updates about the network's keys to all clients."""
-        for vehicle in list(self.vehicles.values()):
-            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-                vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
+        for proxy in self.proxies():
+            proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
     def close(
-        self,
-        reason: str = "the host was stopped",
-        within_s: float = 0.0,
-        hurry: Callable[[], bool] = lambda: False,
+        self, reason: str = "the host was stopped", within_s: float = 0.0, hurry: Callable[[], bool] = lambda: False
     ) -> None:
-        """End all flights and proxies immediately, and all threads that are not stuck. Idempotent.
+        """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
 
-        Args:
-            reason: The reason, shown to users.
-            within_s: Time limit for landings [s].
-            hurry: Polled several times a second; True ends the wait for landings. So does Ctrl-C if nothing else
-                handles it; it is raised at the end.
+        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
+        does Ctrl-C if nothing else handles it; it is raised at the end.
         """
         with self._lock:
             self._closing = True
@@ -243,8 +227,7 @@ class Host:
                 self._end(vehicle, within_s, reason, lambda: hurry() or interrupted.is_set())
 
             def tell(vehicle: HostedVehicle) -> None:
-                proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
-                if proxy is not None and within_s > 0.0:
+                if (proxy := vehicle.proxy) is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
             # Use one thread per vehicle: a driver that hangs must not keep another vehicle in the air.
@@ -283,8 +266,7 @@ class Host:
             else:
                 return
             self._loops.append(new)
-        vehicle = self._of(member)
-        if vehicle is not None:
+        if (vehicle := self._of(member)) is not None:
             self.announce(f"vehicle of {vehicle.settings.name}: its driver has been blocking for {_STALL_S:g} s")
             vehicle.report_stall(_STALL_S)
 
@@ -293,13 +275,11 @@ class Host:
         with self._lock:
             self._loops.remove(loop)
         loop.close()  # in case it ever returns
-        vehicle = self._of(member)
-        if vehicle is not None:
+        if (vehicle := self._of(member)) is not None:
             self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
 
     def _on_failing(self, proxy: Proxy, error: BaseException) -> None:
-        vehicle = self._of(proxy)
-        if vehicle is not None:
+        if (vehicle := self._of(proxy)) is not None:
             self._give_up(vehicle, f"its driver fails at every tick, so that no failsafe runs: {error!r}")
 
     def _give_up(self, vehicle: SharedVehicle, reason: str) -> None:
@@ -316,12 +296,7 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle from the host's file.
-
-    Raises:
-        UnknownNameError: The file has no vehicle with this name.
-        UsageError: The vehicle is already running.
-    """
+    """Return the settings of a vehicle from the host's file that is not running."""
     settings = host.known.get(name)
     if settings is None:
         raise UnknownNameError("vehicle of this host's file", name, host.known)

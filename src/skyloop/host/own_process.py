@@ -50,10 +50,8 @@ def pause_s(deaths: int) -> float:
 class OwnProcessVehicle(HostedVehicle):
     """A vehicle with ``process = "own"``, whose driver can harm only its own process.
 
-    Args:
-        settings: The vehicle's settings.
-        announce: Called with a line of text for users when its process dies and when it is restarted.
-        command: The command that starts the process, to which the name is appended. The settings are passed separately.
+    ``announce``: called with a line of text for users when its process dies and when it is restarted. ``command``:
+    starts the process; the name is appended, and the settings are passed separately.
     """
 
     def __init__(
@@ -93,7 +91,6 @@ class OwnProcessVehicle(HostedVehicle):
             self._reported, self._silent_checks = None, 0
 
     def _read(self, child: ChildProcess) -> None:
-        """Read the reports of a process."""
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)
@@ -177,11 +174,7 @@ class OwnProcessVehicle(HostedVehicle):
 
 
 def serve(settings: VehicleSettings) -> None:
-    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. Must run on the main thread.
-
-    Raises:
-        SkyloopError: The vehicle can't be served.
-    """
+    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. Must run on the main thread."""
     network = network_of(settings)
     driver = make_driver(settings.address)
     end: TransportServer = LocalServer(settings.name, group=settings.group)

@@ -31,7 +31,7 @@ from skyloop.errors import (
 )
 from skyloop.host.fleet import Defaults, Fleet, Vehicle, VehicleSettings, decoder_of_handed, encode_handed, settings_of
 from skyloop.host.host import Host, check_known
-from skyloop.host.vehicle import HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of
+from skyloop.host.vehicle import HostedVehicle, VehicleStatus, network_of, reason_of
 from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, on_signals
@@ -57,19 +57,8 @@ def serve(
 
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
     …`` after all have been tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
-    ``land_within_s`` [s]; a second signal ends the wait.
-
-    Args:
-        fleet: The vehicles.
-        group: Group of users who may also add and remove vehicles.
-        land_within_s: Time limit for landings [s].
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced; None: no endpoint.
-
-    Raises:
-        UsageError: ``metrics`` is not an address, or listening on it failed.
-        MissingExtraError: The extra ``metrics`` is needed and not installed.
-        NameTakenError: A running host has the name.
-        LinkError: The directory of sockets is not safe.
+    ``land_within_s`` [s]; a second signal ends the wait. Members of ``group`` may also add and remove vehicles.
+    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -155,8 +144,8 @@ class _Lines:
 
 
 def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
-    if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
-        return f"{status.address} at {vehicle.proxy.server.address}"
+    if (proxy := vehicle.proxy) is not None:
+        return f"{status.address} at {proxy.server.address}"
     return f"{status.address} at local:{status.name}, process {status.pid}"
 
 
@@ -238,12 +227,6 @@ class ControlServer:
         self._ended = threading.Event()
 
     def start(self) -> None:
-        """Start listening.
-
-        Raises:
-            NameTakenError: A running host has the name.
-            LinkError: The directory of sockets is not safe.
-        """
         self._listener, self._inode = self._directory.listen(self._name)
         self._thread = threading.Thread(
             target=self._run, args=(self._listener,), name="skyloop-host-control", daemon=True
@@ -278,8 +261,7 @@ class ControlServer:
         set_timeout(sock, socket.SO_RCVTIMEO, _SLOW_S)
         set_timeout(sock, socket.SO_SNDTIMEO, _SLOW_S)
         try:
-            answer = self._answer(sock)
-            if answer is not None:
+            if (answer := self._answer(sock)) is not None:
                 _send(sock, msgspec.json.encode(answer))
         except OSError as error:
             _log.info("an answer was not received: %s", error)
@@ -328,12 +310,7 @@ def running_hosts(group: str | None = None) -> list[str]:
 
 
 def chosen_host(name: str | None = None, group: str | None = None) -> str:
-    """Return the host with this name, or the only host that is running.
-
-    Raises:
-        UsageError: No host is running, or several are and no name is given.
-        UnknownNameError: No host with this name is running.
-    """
+    """Return the host with this name, or the only host that is running."""
     running = running_hosts(group)
     if name is not None:
         if name not in running:
@@ -347,13 +324,7 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Send a request to a host and return its answer.
-
-    Raises:
-        UsageError, RefusedError: Nothing was done; the message says why.
-        LinkError: The host can't be reached, or ended in the meantime.
-        NoAnswerError: The host did not answer in time.
-    """
+    """Send a request to a host; return its answer or raise its error, :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:
         directory.check()

@@ -73,6 +73,7 @@ class HostedVehicle(ABC):
         self.condition = Condition.STOPPED
         self.failed = ""  #: the reason, if it has failed
         self.started_s = time.monotonic()
+        self.proxy: Proxy | None = None  #: while it serves in this process
 
     @abstractmethod
     def start(self) -> None:
@@ -84,17 +85,11 @@ class HostedVehicle(ABC):
 
     @abstractmethod
     def end(
-        self,
-        within_s: float,
-        reason: str,
-        hurry: Callable[[], bool] = lambda: False,
-        *,
-        unless_flying: bool = False,
+        self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         """End the vehicle's flight and its proxy, like :meth:`skyloop.proxy.Proxy.end`. Idempotent.
 
-        Returns:
-            Whether the proxy has ended; with ``unless_flying``, only if the vehicle landed in time.
+        Returns whether the proxy has ended; with ``unless_flying``, only if the vehicle landed in time.
         """
 
     @property
@@ -115,14 +110,9 @@ class HostedVehicle(ABC):
 class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
-    Args:
-        settings: The vehicle's settings.
-        reactor: Receives the vehicle's local packets.
-        jobs: Serves the vehicle's slow requests.
-        network: How the proxy joins the network; None for this host only.
-        make: Creates the driver for an address.
-        overview: Returns the rows of all vehicles in this process; None: only its own row is shown.
-        serve_link: Moves a driver's link to a shared thread; None: the link keeps its own.
+    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, ``network`` is None for this host only.
+    ``overview``: returns the rows of all vehicles in this process; None: only its own row is shown. ``serve_link``:
+    moves a driver's link to a shared thread; None: the link keeps its own.
     """
 
     def __init__(
@@ -140,7 +130,6 @@ class SharedVehicle(HostedVehicle):
         self._overview = overview
         self._make = make
         self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
-        self.proxy: Proxy | None = None
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
@@ -207,12 +196,7 @@ class SharedVehicle(HostedVehicle):
         return True
 
     def end(
-        self,
-        within_s: float,
-        reason: str,
-        hurry: Callable[[], bool] = lambda: False,
-        *,
-        unless_flying: bool = False,
+        self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         if self.condition is not Condition.STOPPED:
             self._settled.wait(OPEN_S + 1.0)  # otherwise it might start to serve after its removal
@@ -247,12 +231,7 @@ def of_proxy(proxy: Proxy) -> dict[str, object]:
 
 
 def network_of(settings: VehicleSettings) -> FabricSettings | None:
-    """Return how a vehicle's proxy joins the network; None for this host only.
-
-    Raises:
-        UsageError: An address or the key folder is invalid.
-        MissingExtraError: The extra ``network`` is not installed.
-    """
+    """Return how a vehicle's proxy joins the network; None for this host only."""
     if settings.network is None:
         return None
     from skyloop.network.config import serving
@@ -264,8 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run something that may hang on a separate thread, and raise its exceptions here.
 
-    Returns:
-        Whether the call returned in time. If not, its daemon thread keeps running.
+    Returns whether the call returned in time. If not, its daemon thread keeps running.
     """
     raised: list[BaseException] = []
 

@@ -14,35 +14,21 @@ from typing import TYPE_CHECKING, Final
 from skyloop.clock import NS_PER_S
 from skyloop.extend import Known
 from skyloop.messages import Failsafe, FlightState, LinkState
-from skyloop.metrics.endpoint import FAMILIES, Endpoint, Family, Reading, Source, serve
+from skyloop.metrics.endpoint import FAMILIES, Endpoint, Reading, Source, serve
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Metrics that are counters in the proxy. Absent ones are 0, except those of a network that is not served.
-_COUNTERS: Final = {
-    "skyloop_feedback_published_total": "feedback.published",
-    "skyloop_feedback_selected_total": "feedback.selected",
-    "skyloop_feedback_missed_total": "feedback.missed",
-    "skyloop_commands_received_total": "commands.received",
-    "skyloop_commands_applied_total": "commands.applied",
-    "skyloop_commands_clamped_total": "commands.clamped",
-    "skyloop_commands_superseded_total": "commands.superseded",
-    "skyloop_requests_total": "requests.received",
-    "skyloop_requests_refused_total": "requests.refused",
-    "skyloop_packets_malformed_total": "packets.malformed",
-    "skyloop_packets_refused_total": "packets.refused",
-    "skyloop_events_missed_total": "events.missed",
-    "skyloop_driver_errors_total": "driver.errors",
-}
-_NETWORK: Final = {
-    "skyloop_network_dropped_total": "network.dropped",
-    "skyloop_network_refused_total": "network.refused",
-    "skyloop_network_strays_total": "network.strays",
-    "skyloop_network_turned_away_total": "network.turned_away",
-}
+#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent ones are 0, except those of
+#: a network that is not served.
+_COUNTERS: Final = (
+    *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
+    *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
+    *("events.missed", "driver.errors"),
+)
+_NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
 #: Counters whose name contains a label: the parts of the name before and after it.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
@@ -52,46 +38,18 @@ _LABELLED: Final = {
     "skyloop_frames_missed_total": ("frames.", ".missed"),
 }
 _DELAYS: Final = {"median": "commands.delay.median_s", "p99": "commands.delay.p99_s", "max": "commands.delay.max_s"}
-
-
-__all__ = [
-    "FAMILIES",
-    "Endpoint",
-    "Family",
-    "Reading",
-    "Source",
-    "client_readings",
-    "proxy_readings",
-    "router_readings",
-    "serve",
-    "serve_proxies",
-    "serving_beside",
-]
+__all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # what is passed on from the endpoint
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
-    """Serve the metrics of this process's proxies.
-
-    Args:
-        proxies: Returns the current proxies; called on the endpoint's thread for each scrape.
-        where: ``[HOST:]PORT``; see :func:`serve`.
-
-    Raises:
-        UsageError: ``where`` is not an address, or listening on it failed.
-        MissingExtraError: The extra ``metrics`` is not installed.
-    """
+    """Serve the metrics of the current proxies, which ``proxies`` returns for each scrape; see :func:`serve`."""
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
 
 
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return a context for :func:`skyloop.proxy.serve.run` that serves the metrics of its proxies.
-
-    Args:
-        where: ``[HOST:]PORT``; see :func:`serve`.
-        announce: Called with a line of text that tells users where the metrics are.
-    """
+    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics, and announces where."""
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
         endpoint = serve_proxies(lambda: proxies, where)
@@ -127,11 +85,9 @@ def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
         yield Reading("skyloop_command_age_seconds", (now_ns - authority.last_command_ns) / NS_PER_S, own)
     counts = proxy.statistics()
     yield Reading("skyloop_applications", counts["applications"], own)
-    for metric, counter in _COUNTERS.items():
-        yield Reading(metric, counts.get(counter, 0.0), own)
-    for metric, counter in _NETWORK.items():
-        if counter in counts:
-            yield Reading(metric, counts[counter], own)
+    yield Reading("skyloop_requests_total", counts.get("requests.received", 0.0), own)
+    for counter in (*_COUNTERS, *(counter for counter in _NETWORK if counter in counts)):
+        yield Reading(f"skyloop_{counter.replace('.', '_')}_total", counts.get(counter, 0.0), own)
     for metric, (prefix, suffix) in _LABELLED.items():
         for counter, count in counts.items():
             label = counter.removeprefix(prefix).removesuffix(suffix)

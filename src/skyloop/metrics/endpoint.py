@@ -10,12 +10,11 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 from skyloop.address import is_loopback
@@ -71,12 +70,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands received"),
         Family("skyloop_commands_applied_total", "counter", _VEHICLE, "commands handed to the vehicle"),
         Family("skyloop_commands_clamped_total", "counter", _VEHICLE, "commands lowered to a limit"),
-        Family(
-            "skyloop_commands_superseded_total",
-            "counter",
-            _VEHICLE,
-            "waiting commands replaced by newer ones",
-        ),
+        Family("skyloop_commands_superseded_total", "counter", _VEHICLE, "waiting commands replaced by newer ones"),
         Family("skyloop_commands_refused_total", "counter", ("vehicle", "reason"), "commands refused, by reason"),
         Family(
             "skyloop_command_delay_seconds",
@@ -105,12 +99,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_frames_received_total", "counter", ("vehicle", "camera"), "frames received from the vehicle"),
         Family("skyloop_frames_published_total", "counter", ("vehicle", "camera"), "frames published"),
         Family("skyloop_frames_missed_total", "counter", ("vehicle", "camera"), "frames missed by a subscriber"),
-        Family(
-            "skyloop_network_dropped_total",
-            "counter",
-            _VEHICLE,
-            "dropped packets to single applications",
-        ),
+        Family("skyloop_network_dropped_total", "counter", _VEHICLE, "dropped packets to single applications"),
         Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
         Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
         Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),
@@ -158,31 +147,22 @@ Source = Callable[[], Iterable[Reading]]
 def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: float = DEADLINE_S) -> Endpoint:
     """Serve metrics over HTTP until the endpoint is closed.
 
-    Args:
-        sources: Returns the sources. Like each source, it is called on the endpoint's threads for each scrape.
-        where: ``[HOST:]PORT``; the host defaults to 127.0.0.1, and port 0 picks a free one.
-        deadline_s: Maximum duration of a connection [s]; at most :data:`MAX_SCRAPES` are open at a time.
-
-    Raises:
-        UsageError: ``where`` is not an address, or can't be listened on.
-        MissingExtraError: The extra ``metrics`` is not installed.
+    ``sources`` and each source are called on the endpoint's threads for each scrape. ``where``: ``[HOST:]PORT``; the
+    host defaults to 127.0.0.1, and port 0 picks a free one. ``deadline_s``: maximum duration of a connection [s]; at
+    most :data:`MAX_SCRAPES` are open at a time.
     """
     return Endpoint(sources, parse_where(where), deadline_s)
 
 
 def parse_where(where: str) -> tuple[str, int]:
-    """Return host and port from ``[HOST:]PORT``; IPv6 addresses are in brackets.
-
-    Raises:
-        UsageError: The text has another form.
-    """
+    """Return host and port from ``[HOST:]PORT``; IPv6 addresses are in brackets."""
     host, colon, port = where.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) <= 65535) or (colon and not host):
         raise UsageError(f"{where!r:.80} is not an address for metrics: give a port, 0 to 65535, or HOST:PORT")
     return (host.removeprefix("[").removesuffix("]") if colon else LOOPBACK), int(port)
 
 
-class Endpoint:
+class Endpoint(AbstractContextManager["Endpoint"]):
     """Serves metrics over HTTP. Created by :func:`serve`; a context manager that closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
@@ -195,7 +175,6 @@ class Endpoint:
 
     @property
     def port(self) -> int:
-        """The TCP port."""
         return int(self._server.server_address[1])
 
     @property
@@ -216,12 +195,7 @@ class Endpoint:
         self._thread.join()
         self._server.server_close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -44,11 +44,7 @@ class Admission(NamedTuple):
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join; return its terms, including the proxy's answer. Without keys, everyone is admitted.
-
-    Raises:
-        LinkError: The application has no key from this lab, someone else's key, or one that may not see this drone.
-    """
+    """Check a request to join; return its terms, including the proxy's answer. Without keys, everyone is admitted."""
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
     from skyloop.network.keys.agreement import Agreement
@@ -82,11 +78,7 @@ class JoinRequest:
             self.proof = self._agreement.offer()
 
     def accept(self, welcome: packets.Welcome) -> Admission:
-        """Check the proxy's answer and return the terms of the connection.
-
-        Raises:
-            LinkError: The answer is damaged, or its sender has no key to serve this drone.
-        """
+        """Check the proxy's answer; return the terms. An impostor's answer raises :class:`LinkError`."""
         if not self.proof:
             return Admission()
         agreed = self._agreement.accept(welcome.proof)
@@ -112,12 +104,9 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no room for another connection; empty if there is room.
+    """Return why there is no room for another connection of ``who``; empty if there is.
 
-    Args:
-        who: The identity that requests the connection.
-        may_fly: Whether that identity may fly this drone.
-        present: The current connections, each given by its identity and whether that may fly this drone.
+    ``present``: the identity behind each connection, and whether that may fly this drone.
     """
     here = list(present)
     own = sum(other == who for other, _ in here)
@@ -150,7 +139,6 @@ class Tokens:
         return True
 
     def discard(self, who: str, connection: str) -> None:
-        """Remove a token."""
         seen = self._seen.get(who)
         if seen is not None:
             seen.discard(connection)
@@ -158,7 +146,6 @@ class Tokens:
                 del self._seen[who]
 
     def has(self, who: str, connection: str) -> bool:
-        """Return whether there is a token for a connection."""
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:

@@ -1,23 +1,28 @@
-"""The application's end of the fabric transport."""
+"""The application's end of the fabric transport, and the topics to which it has subscribed."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
+from skyloop.messages import FrameHeader, Refusal, Refused, Reply, Request, decode, encode
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
 from skyloop.network.config import FabricSettings, Part
-from skyloop.network.delivery import DEPTH, Outgoing, Receiver
+from skyloop.network.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, Outgoing, Receiver, RecentPackets
 from skyloop.network.discovery import SYNC_S, ProxyWatch, join, proxy_reached, renew
-from skyloop.network.sealing import contents
+from skyloop.network.frames import WINDOW
+from skyloop.network.sealing import Opener, contents
 from skyloop.network.session import Session, acquire, load, release, retire, undeclare
-from skyloop.network.subscription import Subscription
 from skyloop.transport.base import (
     MAX_PACKET,
     ClientHandler,
@@ -26,10 +31,13 @@ from skyloop.transport.base import (
     check_name,
     check_packet,
     check_topic,
+    video,
 )
 
 if TYPE_CHECKING:
     import zenoh
+
+    from skyloop.network.keys import Identity
 
 GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
@@ -40,23 +48,16 @@ POLL_S: Final = 0.05  #: interval between checks for packets to resend
 STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
 KEYS_S: Final = 0.5  #: interval between checks for a newer roster
 FAREWELL_S: Final = 0.3  #: time to wait for an answer to a bye
+_VIDEO: Final = video("")
+_UNNUMBERED: Final = packets.number(0)
 _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return a dialer for a proxy on the network.
+    """Return a dialer for a proxy on the network, which takes up to ``find_s`` [s] to find it.
 
     The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
     proxy does not admit the application.
-
-    Args:
-        name: The proxy's name.
-        settings: How to join the network; by default by multicast, without keys.
-        find_s: Time allowed to find the proxy in each call of the dialer [s].
-
-    Raises:
-        UsageError: The name is invalid, or the keys are not those of an application.
-        MissingExtraError: The extra ``network`` is not installed.
     """
     check_name(name)
     load()
@@ -107,6 +108,99 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     return dialer
 
 
+class Subscription:
+    """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
+
+    ``run``: the proxy's run; packets that others publish under its name are ignored. ``enqueue``: called with this
+    subscription, a packet (empty: a frame is due) and its number, which must be passed to :meth:`deliver` in order.
+    ``reject``: called with the reason when a packet did not come from the proxy.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        run: bytes,
+        opener: Opener,
+        enqueue: Callable[[Subscription, bytes, int], object],
+        reject: Callable[[DecodeError], None],
+    ) -> None:
+        self._topic = topic
+        self._run = run
+        self._opener = opener
+        self._enqueue = enqueue
+        self._reject = reject
+        #: Whether only the newest packet counts, so that packets and their acknowledgements are sent as datagrams.
+        self.newest_wins = layout.newest_wins(topic)
+        self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
+        self._recent = RecentPackets()
+        self._waiting = 0  # number of waiting packets
+        self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
+        self._newest = 0  # number of the newest frame received
+        self._ended = False
+
+    def declare(self, session: Session, name: str, connection: str) -> list[Any]:
+        """Subscribe on a Zenoh session. The caller must undeclare the returned declarations."""
+        z, call, topic = session.zenoh, session.callback, self._topic
+        if not topic.startswith(_VIDEO):
+            return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
+        camera, _, form = topic.removeprefix(_VIDEO).partition("?")
+        keys = (layout.video(name, camera, form), layout.video_for(name, camera, form, connection))
+        return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
+
+    def end(self) -> None:
+        """Stop delivering frames, including queued ones."""
+        self._ended = True
+
+    def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
+        """Deliver the next item to the handler; return the packet that acknowledges it, empty if none is needed."""
+        if packet:
+            self._waiting -= 1
+            handler.packet(packet)
+            return packets.taken(self._topic, number) if self._ack_policy.count(number, 0, time.monotonic()) else b""
+        number, header, data = self._frames.popleft()
+        if self._ended:
+            return b""
+        handler.frame(header, np.frombuffer(data, np.uint8), self._topic)
+        return packets.seen(self._topic, number)
+
+    # --- callbacks, on Zenoh's threads ---
+
+    def _on_packet(self, sample: zenoh.Sample) -> None:
+        try:
+            opened = contents(self._opener, sample)
+            if opened is None:
+                return
+            packet = opened[0]
+            run, number = packets.parse_published(opened[1])
+        except DecodeError as error:
+            self._reject(error)
+            return
+        if run == self._run and self._waiting < DEPTH and self._recent.is_new(number, packet):
+            self._waiting += 1
+            self._enqueue(self, packet, number)
+
+    def _on_frame(self, sample: zenoh.Sample) -> None:
+        """Queue a frame, replacing one that is already queued."""
+        opener = self._opener
+        try:
+            attachment = packets.copied(sample.attachment, packets.MAX_OWN)
+            run, number, header = packets.parse_frame(attachment[: len(attachment) - opener.trailer])
+            if run != self._run or number <= self._newest or len(sample.payload) != header.size + opener.tag:
+                return
+            opened = opener.open(str(sample.key_expr), attachment, bytes(sample.payload))
+            if opened is None:
+                return
+        except DecodeError as error:
+            self._reject(error)
+            return
+        self._newest = number
+        if len(self._frames) >= WINDOW:
+            self._frames[-1] = (number, header, opened[0])
+        else:
+            self._frames.append((number, header, opened[0]))
+            self._enqueue(self, b"", number)
+
+
 #: For the receiving thread: a packet of a topic (None: for this end only; empty: a frame) and its number.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
@@ -115,17 +209,9 @@ _WAKE: Final[_Item] = (None, b"", 0)
 class FabricClient(TransportClient):
     """The application's end, created by the dialer from :func:`dial`.
 
-    Args:
-        session: The Zenoh session; released when the connection ends, but not if the constructor raises.
-        name: The proxy's name.
-        handler: Called on the receiving thread.
-        find_s: Time allowed to find the proxy [s].
-        list_s: Additional time for linked nodes to list the proxies that they know [s].
-        known: The proxy's description of itself, if received earlier.
-
-    Raises:
-        UnknownNameError: No proxy with this name can be reached.
-        LinkError: The proxy does not admit this application, or does not answer (:class:`NoAnswerError`).
+    It releases its session when the connection ends, but not if the constructor raises: :class:`UnknownNameError` if
+    there is no such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]; :class:`LinkError` if
+    it does not admit this application; :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
     """
 
     def __init__(
@@ -137,7 +223,7 @@ class FabricClient(TransportClient):
         list_s: float,
         known: packets.ProxyInfo | None = None,
     ) -> None:
-        self._session = session
+        self.session = session  #: the Zenoh session, which may be shared with other connections
         self.parted = False  #: whether the proxy has announced or accepted the end of this connection
         self._name = name
         self._handler = handler
@@ -175,11 +261,7 @@ class FabricClient(TransportClient):
         self._thread.start()
 
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
-        """Find the proxy and join it.
-
-        Raises: LinkError: The proxy does not admit us. UnknownNameError: There is no such proxy.
-        """
-        session, name = self._session, self._name
+        session, name = self.session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone, known)
         self._held.append(watch.declare())
         candidates = watch.find(find_s, list_s)
@@ -206,8 +288,7 @@ class FabricClient(TransportClient):
             if self._ended:
                 return False
             if way != layout.ASK and self._observer is not None:
-                answer = layout.refusal_reply(packet, self._observer, self._name)
-                if answer is not None:
+                if (answer := refusal_reply(packet, self._observer, self._name)) is not None:
                     self._inbox.put((None, answer, 0))
                 return answer is not None
             if way == layout.COMMAND:
@@ -225,7 +306,7 @@ class FabricClient(TransportClient):
                 wanted = Subscription(
                     topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
                 )
-                self._subscriptions[topic] = wanted, wanted.declare(self._session, self._name, self._id)
+                self._subscriptions[topic] = wanted, wanted.declare(self.session, self._name, self._id)
             sent = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
             declared: list[Any] = []
             if not on:
@@ -241,11 +322,6 @@ class FabricClient(TransportClient):
             self._thread.join()
 
     @property
-    def session(self) -> Session:
-        """The Zenoh session, which may be shared with other connections."""
-        return self._session
-
-    @property
     def same_clock(self) -> bool:
         return False
 
@@ -255,7 +331,7 @@ class FabricClient(TransportClient):
 
     @property
     def excused_s(self) -> float:
-        return self._session.settings.excused_s
+        return self.session.settings.excused_s
 
     @property
     def address(self) -> str:
@@ -263,26 +339,16 @@ class FabricClient(TransportClient):
 
     def _send_command(self, packet: bytes) -> bool:
         if self._command is None:
-            self._command = self._best_effort(self._command_key, load().Priority.REAL_TIME)
+            self._command = self.session.publisher(self._command_key, "REAL_TIME", best_effort=True)
         return self._send_once(self._command, self._command_key, packet)
 
     def _send_report(self, packet: bytes) -> bool:
         if self._report is None:
-            self._report = self._best_effort(self._report_key, load().Priority.DATA_HIGH)
+            self._report = self.session.publisher(self._report_key, "DATA_HIGH", best_effort=True)
         return self._send_once(self._report, self._report_key, packet)
 
-    def _best_effort(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
-        z = load()
-        return self._session.zenoh.declare_publisher(
-            key,
-            congestion_control=z.CongestionControl.DROP,
-            priority=priority,
-            reliability=z.Reliability.BEST_EFFORT,
-            express=True,
-        )
-
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost and that nobody waits for."""
+        """Send a packet that may be lost, without waiting."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)
@@ -306,19 +372,11 @@ class FabricClient(TransportClient):
             self._put(way, packet, number)
 
     def _put(self, way: str, packet: bytes, number: int) -> bool:
-        z = load()
         key = layout.upward(way, self._name, self._who, self._id)
-        payload, attachment = self._admission.sealer.seal(key, packets.number(number), packet)
+        sealed = self._admission.sealer.seal(key, packets.number(number), packet)
         try:
-            self._session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_HIGH,
-                express=True,
-            )
-        except z.ZError as error:
+            self.session.put(key, *sealed, "DATA_HIGH")
+        except load().ZError as error:
             _log.debug("%s: not sent: %s", self._name, error)
             return False
         return True
@@ -394,7 +452,7 @@ class FabricClient(TransportClient):
         self._keys_s = now_s + KEYS_S
         for change in ring.poll():
             _log.warning("%s", change)
-        linked = self._session.shut_out()
+        linked = self.session.shut_out()
         if not ring.admits(proxy):
             reason = f"the keys of the proxy, {proxy}, were revoked or changed"
         elif not ring.admits(ring.credentials.identity):
@@ -405,7 +463,7 @@ class FabricClient(TransportClient):
             reason = f"linked to a node whose keys were revoked or changed: {', '.join(sorted(linked))}"
         else:
             return
-        retire(self._session)  # the next session will use the newer roster
+        retire(self.session)  # the next session will use the newer roster
         self._end(reason)
 
     # --- the end of the connection ---
@@ -447,7 +505,7 @@ class FabricClient(TransportClient):
             with self._lock:
                 self._send_due()
         self._undeclare()
-        release(self._session)
+        release(self.session)
         try:
             self._handler.closed(self._reason)
         except Exception:  # noqa: BLE001  (a handler may raise anything)
@@ -472,8 +530,7 @@ class FabricClient(TransportClient):
         if subscription is None:
             self._handler.packet(packet)
             return
-        answer = subscription.deliver(self._handler, packet, number)
-        if answer:
+        if answer := subscription.deliver(self._handler, packet, number):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
@@ -487,4 +544,16 @@ class FabricClient(TransportClient):
                 self._put(layout.ASK, packet, 0)
 
 
-_UNNUMBERED: Final = packets.number(0)
+def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
+    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
+
+    None if the packet is not a request.
+    """
+    try:
+        sample = decode(packet)
+    except DecodeError:
+        return None
+    if not isinstance(sample, Request):
+        return None
+    text = f"these are the keys of {identity}: they give no right to fly or configure {drone!r}"
+    return encode(Reply(sample.id, Refused(Refusal.OBSERVER, text)))

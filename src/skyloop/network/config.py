@@ -65,9 +65,6 @@ class FabricSettings:
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
     (port 7447). Each means both TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC
     with keys. An address may also be a full Zenoh endpoint such as ``tcp/10.0.0.5:7447``, which is used unchanged.
-
-    Raises:
-        UsageError: The identity is invalid or has no certificate and key, or the lease is out of range.
     """
 
     listen: tuple[str, ...] = ()
@@ -84,11 +81,7 @@ class FabricSettings:
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
-        """Return these settings with the newest roster in the key folder, for use by a new session.
-
-        Raises:
-            LinkError: That roster revokes the keys in use.
-        """
+        """Return these settings with the newest roster in the folder; :class:`LinkError` if it revokes our keys."""
         if self.ring is None:
             return self
         self.ring.refresh()
@@ -125,8 +118,8 @@ class FabricSettings:
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
     """Return these settings with keys: mutual TLS over QUIC, and access control based on their roster."""
-    from skyloop.network.access import access_control
     from skyloop.network.keys import KeyRing  # imported only if there are keys: needs cryptography
+    from skyloop.network.keys.identity import access_control
 
     return replace(
         settings,
@@ -143,38 +136,26 @@ NetworkChoice = bool | str | FabricSettings | None
 
 
 def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return the network settings, or None to stay on this host.
+    """Return the network settings, or None to stay on this host; by default, the environment's.
 
-    Log a warning if the key expires within a week.
-
-    Args:
-        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``. If that is not set, nothing
-            leaves this host.
-        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address, the folder or the variable ``SKYLOOP_LEASE_S`` is invalid.
+    Log a warning if the key expires within a week. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
-    found = _choose(network, keys)
-    if found is not None and found.ring is not None:
-        for change in found.ring.poll():
-            _log.warning("%s", change)
-    return found
-
-
-def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings | None:
     if isinstance(network, FabricSettings):
-        return network if keys is None else secure(network, keys)
-    requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
-    if isinstance(requested, bool):
-        requested = MULTICAST if requested else ""
-    if requested.strip().lower() in _OFF:
-        if keys is not None and network is None:
-            raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
-        return None
-    words = [word.strip() for word in requested.split(",") if word.strip()]
-    connect = tuple(word for word in words if word.lower() not in _ON)
-    return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+        found = network if keys is None else secure(network, keys)
+    else:
+        requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
+        if isinstance(requested, bool):
+            requested = MULTICAST if requested else ""
+        if requested.strip().lower() in _OFF:
+            if keys is not None and network is None:
+                raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
+            return None
+        words = [word.strip() for word in requested.split(",") if word.strip()]
+        connect = tuple(word for word in words if word.lower() not in _ON)
+        found = settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+    for change in () if found.ring is None else found.ring.poll():
+        _log.warning("%s", change)
+    return found
 
 
 def serving(
@@ -187,15 +168,8 @@ def serving(
 ) -> FabricSettings:
     """Return the network settings for a proxy, a host or a router.
 
-    Args:
-        network: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
-        listen: Addresses to listen on.
-        connect: Further addresses to connect to.
-        multicast: Whether multicast discovery is used if ``network`` includes it.
-        keys: An identity's folder; defaults to ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address or the folder is invalid, or no address is given.
+    ``network``: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
+    ``multicast=False`` forbids it nevertheless. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -213,11 +187,7 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``.
-
-    Raises:
-        UsageError: An address or the folder is invalid.
-    """
+    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
     endpoints_of((*listen, *connect), found)  # reports invalid addresses before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
@@ -234,11 +204,7 @@ def _lease_s() -> float:
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """Return these settings with the identity in the given folder.
-
-    Raises:
-        UsageError: The folder is invalid, or an address can't be used with keys.
-    """
+    """Return these settings with the identity in the given folder."""
     from skyloop.network.keys import load  # imported only if there are keys: needs cryptography
 
     found = secured(plain, load(folder))
@@ -273,11 +239,7 @@ _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration by section; ``listen`` replaces the endpoints in the settings.
-
-    Raises:
-        UsageError: An address is invalid.
-    """
+    """Return Zenoh's configuration by section; ``listen`` replaces the endpoints in the settings."""
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
@@ -286,6 +248,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
+    usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]  # with keys, nothing is accepted unencrypted
     found: dict[str, Any] = {
         "mode": "router" if part is Part.ROUTER else "peer",
         "listen": {"endpoints": endpoints},
@@ -298,7 +261,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         "transport": {
             "unicast": {"max_links": 2, "open_timeout": OPEN_GIVEN_MS if connect else OPEN_MS},
             "link": {
-                "protocols": _protocols([*endpoints, *connect], settings),
+                "protocols": sorted({*usual, *(each.partition("/")[0] for each in (*endpoints, *connect))}),
                 "tx": {
                     "lease": lease_ms,
                     "keep_alive": KEEP_ALIVES,
@@ -326,11 +289,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """Convert addresses (``HOST:PORT``, ``HOST`` or full endpoints) to Zenoh's: QUIC with keys, otherwise TCP and UDP.
-
-    Raises:
-        UsageError: An address is invalid, or unencrypted although keys are used.
-    """
+    """Convert addresses (``HOST:PORT``, ``HOST``, full endpoints) to Zenoh's: QUIC with keys, otherwise TCP and UDP."""
     found: list[str] = []
     for address in addresses:
         if "/" in address:
@@ -354,16 +313,10 @@ def to_json(sections: dict[str, Any]) -> str:
 
 
 def listening(settings: FabricSettings) -> list[str]:
-    """Return the addresses to listen on, with a free port in place of port 0.
-
-    If the settings have no addresses, listen on a free port on all interfaces.
-
-    Raises:
-        LinkError: No port is free.
-    """
+    """Return the addresses to listen on, with free ports in place of port 0; by default one on all interfaces."""
     addresses = settings.listen or (f"{all_interfaces()}:0",)
     return [
-        f"{address.removesuffix(':0')}:{free_port(_host(address))}"
+        f"{address.removesuffix(':0')}:{free_port(address.rpartition(':')[0].strip('[]'))}"
         if address.endswith(":0") and "/" not in address
         else address
         for address in addresses
@@ -371,11 +324,7 @@ def listening(settings: FabricSettings) -> list[str]:
 
 
 def free_port(host: str) -> int:
-    """Return a port that is currently free for both TCP and UDP.
-
-    Raises:
-        LinkError: No port is free, or this host does not have the address.
-    """
+    """Return a port that is currently free for both TCP and UDP."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         for _ in range(50):
@@ -403,12 +352,6 @@ def _called(part: Part, has_addresses: bool) -> list[str]:
     return [] if has_addresses or part is Part.ROUTER else ["router"]
 
 
-def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
-    """Return the accepted protocols: only encrypted ones if there are keys."""
-    usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
-    return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
-
-
 def _tls(settings: FabricSettings) -> dict[str, Any]:
     assert settings.tls is not None
     certificate, key = str(settings.tls.certificate), str(settings.tls.key)
@@ -426,11 +369,7 @@ def _tls(settings: FabricSettings) -> dict[str, Any]:
 
 
 def _with_port(address: str) -> str:
-    """Return an address as HOST:PORT.
-
-    Raises:
-        UsageError: The text is not an address.
-    """
+    """Return an address as HOST:PORT."""
     host, colon, port = address.rpartition(":")
     if address.startswith("[") and address.endswith("]"):
         return f"{address}:{DEFAULT_PORT}"
@@ -440,10 +379,6 @@ def _with_port(address: str) -> str:
     if not host or not bare or not port.isdecimal() or int(port) > 65535:
         raise UsageError(f"{address!r} is not a network address, such as 10.0.0.5:7447, [fe80::1]:7447 or lab.local")
     return f"{host}:{port}"
-
-
-def _host(address: str) -> str:
-    return address.rpartition(":")[0].strip("[]")
 
 
 def all_interfaces() -> str:

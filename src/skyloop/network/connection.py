@@ -19,8 +19,8 @@ from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
 from skyloop.network.frames import FramePublisher, Variant
 from skyloop.network.sealing import Sealer
-from skyloop.network.session import Session, load
-from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, Pixels, results, stream, too_many_topics, video
+from skyloop.network.session import Priority, Session, load
+from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, results, stream, too_many_topics, video
 from skyloop.transport.priority import PacketBacklog
 
 if TYPE_CHECKING:
@@ -39,27 +39,6 @@ _RESULTS: Final = results("")
 
 class ServerConnection:
     """An application connected to the transport server. Its lock guards its outgoing packets and its topics."""
-
-    __slots__ = (
-        "_own",
-        "_taken",
-        "admission",
-        "announced",
-        "commands",
-        "confirmed",
-        "ended",
-        "id",
-        "joined_s",
-        "left",
-        "lock",
-        "outgoing",
-        "paces",
-        "peer",
-        "reason",
-        "receiver",
-        "topics",
-        "who",
-    )
 
     def __init__(self, peer: Peer, who: str, connection: str, joined_s: float, admission: Admission) -> None:
         self.peer = peer
@@ -91,15 +70,9 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet a topic has been acknowledged.
+        """Record up to which packet of a topic, or (if empty) of those to this application only, it has acknowledged.
 
-        Args:
-            topic: The topic; empty for packets sent to this application only.
-            number: The last acknowledged packet.
-            now_s: The monotonic clock [s].
-
-        Returns:
-            Whether further packets sent to this application only may be due.
+        Returns whether further packets sent to this application only may be due.
         """
         with self.lock:
             if not topic:
@@ -134,11 +107,7 @@ class ServerConnection:
             self._taken = max(self._taken, number)
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
-        """Return the packets to send now.
-
-        Returns:
-            The packets with their numbers (0: the transport's own), and whether more may become due later.
-        """
+        """Return the packets to send now (number 0: the transport's own), and whether more may become due later."""
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
@@ -154,12 +123,7 @@ Put = Callable[[ServerConnection, bytes, int], object]
 
 
 class Sender:
-    """Sends the connections' packets and resends unacknowledged ones. :meth:`wake` may be called on any thread.
-
-    Args:
-        put: Sends one packet; called on the sender's thread.
-        name: The proxy's name, used in the thread's name.
-    """
+    """Sends the connections' packets by ``put`` in its thread, and resends unacknowledged ones."""
 
     def __init__(self, put: Put, name: str) -> None:
         self._put = put
@@ -170,11 +134,10 @@ class Sender:
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Schedule the sending of a connection's due packets."""
+        """Schedule the sending of a connection's due packets. Any thread."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()
@@ -268,26 +231,14 @@ class Publisher:
                 publisher = self._publishers[topic] = self._declare(session, topic)
         key = layout.topic(self._name, topic)
         payload, attachment = self._sealer.seal(key, packets.published(self._run, number), packet)
-        z = load()
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
             else:  # the topic was named by an application: leave no declaration behind
-                session.zenoh.put(
-                    key,
-                    payload,
-                    attachment=attachment,
-                    congestion_control=z.CongestionControl.DROP,
-                    priority=z.Priority.DATA,
-                    express=True,
-                )
-        except z.ZError:
+                session.put(key, payload, attachment, "DATA")
+        except load().ZError:
             return len(subscribed)  # stopping
         return sum(connection.lags(topic, number) for connection in subscribed)
-
-    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that will miss it."""
-        return self.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
         """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
@@ -345,22 +296,16 @@ class Publisher:
                 self._publishers.pop(topic, None)  # it ends with its last user
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
-        z = load()
         newest_wins = layout.newest_wins(topic)
-        usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # the same as for frames
-        return session.zenoh.declare_publisher(
-            layout.topic(self._name, topic),
-            congestion_control=z.CongestionControl.DROP,
-            priority=z.Priority.REAL_TIME if newest_wins else usual,
-            reliability=z.Reliability.BEST_EFFORT if newest_wins else z.Reliability.RELIABLE,
-            express=True,
-        )
+        usual: Priority = "DATA_LOW" if topic.startswith(_STREAMS) else "DATA"  # the same as for frames
+        priority: Priority = "REAL_TIME" if newest_wins else usual
+        return session.publisher(layout.topic(self._name, topic), priority, best_effort=newest_wins)
 
     def _send_frame(
         self, variant: Variant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
         """Send an encoded frame. Called on the camera's thread."""
-        z, session, request = load(), self._session, variant.request
+        session, request = self._session, variant.request
         if session is None:
             return
         camera, form = request.camera, request.variant
@@ -371,12 +316,4 @@ class Publisher:
         )
         described = packets.frame(self._run, number, encode(header))
         for key in keys:
-            payload, attachment = self._sealer.seal(key, described, data)
-            session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_LOW,
-                express=True,
-            )
+            session.put(key, *self._sealer.seal(key, described, data), "DATA_LOW")

@@ -55,15 +55,9 @@ class Outgoing:
         self._headway_s = 0.0  # when the other end last acknowledged a packet, or when an idle path got its first one
 
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
-        """Keep another packet until it is acknowledged.
+        """Keep another packet, sent by the key ``way``, until it is acknowledged; return False if there is no room.
 
-        Args:
-            packet: The packet.
-            way: The key that the sender sends it by.
-            own: Whether it is one of the transport's own small packets, for which extra room is reserved.
-
-        Returns:
-            False if there is no room for it.
+        ``own``: it is one of the transport's own small packets, for which extra room is reserved.
         """
         if own:
             full = len(self._kept) >= 2 * self._depth
@@ -98,10 +92,7 @@ class Outgoing:
         return found
 
     def taken(self, number: int, now_s: float) -> None:
-        """Remove the packets up to this number, which the other end has acknowledged.
-
-        A number that has not been sent yet is ignored.
-        """
+        """Remove the packets acknowledged up to this number; ignore a number that has not been sent yet."""
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
         while self._under_way and self._kept[0].number <= number:
@@ -144,11 +135,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when a subscriber acknowledges a topic's packets. Not thread-safe.
-
-    Args:
-        every_s: Also acknowledge the first packet after this time [s].
-    """
+    """Decides when a subscriber acknowledges a topic's packets, within ``every_s`` [s]. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0
@@ -237,18 +224,7 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet that the other end resends until it is acknowledged.
-
-        Args:
-            number: The packet's number, from 1.
-            packet: The packet.
-            has_room: Whether there is room for another packet; if not, this one is ignored and will be resent.
-            control: Handles the transport's own packets.
-            deliver: Handles all others.
-
-        Returns:
-            The number up to which all packets were accepted, to be acknowledged.
-        """
+        """Receive a packet, to be resent if there is no room; return the number up to which all were accepted."""
         with self._lock:
             if has_room():
                 for each in self._incoming.take(number, packet):

@@ -46,17 +46,7 @@ MAX_CANDIDATES: Final = 4  #: with keys: number of proxies with one name that ar
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
-    """List the proxies that this process can reach over the network. Takes about a second.
-
-    Args:
-        settings: How to join the network.
-
-    Returns:
-        The proxies, sorted by name and, for equal names, by age, oldest first.
-
-    Raises:
-        LinkError: Joining the network failed.
-    """
+    """List the proxies that this process can reach over the network, by name and age. Takes about a second."""
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
@@ -67,11 +57,7 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
 
 
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, oldest first. There are several only if a network was split.
-
-    Raises:
-        LinkError: Joining the network failed.
-    """
+    """Return the proxies with this name, oldest first. There are several only if a network was split."""
     if not settings.multicast and not settings.connect:
         return []  # others would have to connect to us, but we don't listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
@@ -205,19 +191,12 @@ def _search(session: Session) -> set[str]:
 class ProxyWatch:
     """Monitors which transport servers with one name are alive.
 
-    Args:
-        session: The Zenoh session.
-        name: The proxy's name.
-        on_gone: Called with the run of a transport server that disappears, on one of Zenoh's threads.
-        known: The description of a proxy with this name, if received earlier; it is not requested again.
+    ``on_gone``: called with the run of one that disappears, on one of Zenoh's threads. ``known``: the description of a
+    proxy with this name, if received earlier; it is not requested again.
     """
 
     def __init__(
-        self,
-        session: Session,
-        name: str,
-        on_gone: Callable[[str], None],
-        known: packets.ProxyInfo | None = None,
+        self, session: Session, name: str, on_gone: Callable[[str], None], known: packets.ProxyInfo | None = None
     ) -> None:
         self._session = session
         self._name = name
@@ -235,13 +214,9 @@ class ProxyWatch:
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
         """Wait for a proxy with this name, then up to ``list_s`` [s] for linked nodes to list theirs.
 
-        Returns:
-            Each candidate's run and description, best first. The best is the oldest; with keys the others follow,
-            because the oldest may have no key for this name.
-
-        Raises:
-            UnknownNameError: No proxy with this name can be reached.
-            NoAnswerError: A proxy was found but has disappeared, or a linked node does not list its tokens.
+        Returns each candidate's run and description, best first. The best is the oldest; with keys the others follow,
+        because the oldest may have no key for this name. Raises :class:`UnknownNameError` if there is none, and
+        :class:`NoAnswerError` if one was found but has disappeared, or a linked node does not list its tokens.
         """
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
@@ -289,11 +264,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask one run of a proxy to admit a connection; return its terms.
-
-    Raises:
-        LinkError: The proxy refuses or does not answer (:class:`NoAnswerError`), or an impostor answers.
-    """
+    """Ask one run of a proxy to admit a connection; return its terms."""
     z, who, ring = load(), session.settings.who, session.settings.ring
     request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))
     program = Path(sys.argv[0]).name[:64]

@@ -105,10 +105,9 @@ class FramePublisher:
         self._unable: set[str] = set()  # topics whose encoding failed and has been logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame. If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
+        """Publish a frame; return the number of readers that miss it, having :data:`WINDOW` frames in flight.
 
-        Returns:
-            The number of readers that miss it because :data:`WINDOW` frames are in flight to them.
+        If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
         """
         variants = self._variants.get(header.camera)
         if not variants:
@@ -167,8 +166,7 @@ class FramePublisher:
             return self._problem(key, topic)
 
     def _problem(self, key: Hashable, topic: str) -> str:
-        unknown = self.topic_problem(topic)
-        if unknown:
+        if unknown := self.topic_problem(topic):
             return unknown
         try:
             request = VideoRequest.parse(topic)
@@ -246,11 +244,9 @@ class FramePublisher:
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
-        """Wait for a variant that has readers due for a frame.
+        """Wait for a variant with readers due for its newest frame; return all three (readers None: all).
 
-        Returns:
-            The variant, its newest frame and those readers (None: all). None at the end, or if the camera has no
-            readers.
+        None at the end, or if the camera has no readers.
         """
         with self._changed:
             while not self._ended and camera in self._variants:

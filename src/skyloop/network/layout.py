@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import secrets
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import quote, unquote
 
 from skyloop.errors import DecodeError, UsageError
@@ -23,9 +23,6 @@ from skyloop.messages import (
     JoinProcessor,
     ListParameters,
     Ping,
-    Refusal,
-    Refused,
-    Reply,
     Request,
     StreamReport,
     VehiclePose,
@@ -34,9 +31,6 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import KINDS
 from skyloop.transport.base import FEEDBACK, NAME
-
-if TYPE_CHECKING:
-    from skyloop.network.keys import Identity
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO if there are no keys
@@ -67,7 +61,6 @@ class Sender(NamedTuple):
 
 
 def new_id() -> str:
-    """Return a new random ID or RUN."""
     return secrets.token_hex(8)
 
 
@@ -127,11 +120,7 @@ def downward(name: str) -> tuple[str, str, str]:
 
 
 def parse_sender(key: str) -> Sender:
-    """Return the application that a key belongs to.
-
-    Raises:
-        DecodeError: The key is not an application's.
-    """
+    """Return the application that a key belongs to."""
     parts = key.split("/")
     if len(parts) == 6 and WHO.fullmatch(parts[4]) and ID.fullmatch(parts[5]):
         return Sender(parts[3], parts[4], parts[5])
@@ -139,11 +128,7 @@ def parse_sender(key: str) -> Sender:
 
 
 def parse_alive(key: str) -> tuple[str, str]:
-    """Parse NAME and RUN from the key of a transport server's token.
-
-    Raises:
-        DecodeError: The key is not that of a transport server's token.
-    """
+    """Parse NAME and RUN from the key of a transport server's token."""
     parts = key.split("/")
     if len(parts) == 5 and parts[3] == "alive" and NAME.fullmatch(parts[2]) and ID.fullmatch(parts[4]):
         return parts[2], parts[4]
@@ -156,11 +141,7 @@ def parse_topic(key: str) -> str:
 
 
 def check_identity(who: str) -> None:
-    """Check that an identity is valid.
-
-    Raises:
-        UsageError: It can't be used as WHO.
-    """
+    """Check that an identity can be used as WHO."""
     if not WHO.fullmatch(who):
         raise UsageError(
             f"{who!r} cannot be an identity: 1 to 64 letters, digits, '_', '-' and '.', the first one a letter or digit"
@@ -192,22 +173,6 @@ def way_of(packet: bytes) -> str:
 def is_report(packet: bytes) -> bool:
     """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong if it arrives late."""
     return packet[:6] == _REPORT
-
-
-def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
-
-    Returns:
-        The reply's packet; None if the packet is not a request.
-    """
-    try:
-        sample = decode(packet)
-    except DecodeError:
-        return None
-    if not isinstance(sample, Request):
-        return None
-    text = f"these are the keys of {identity}: they give no right to fly or configure {drone!r}"
-    return encode(Reply(sample.id, Refused(Refusal.OBSERVER, text)))
 
 
 def allows(way: str, packet: bytes) -> bool:

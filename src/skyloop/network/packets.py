@@ -124,17 +124,14 @@ def is_own(packet: bytes) -> bool:
 
 
 def subscribe(topic: str, on: bool) -> bytes:
-    """Encode a :class:`Subscribe`."""
     return _packet(FabricKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def taken(topic: str, number: int) -> bytes:
-    """Encode a :class:`Taken`."""
     return _packet(FabricKind.TAKEN, _NUMBER.pack(number) + topic.encode())
 
 
 def seen(topic: str, number: int) -> bytes:
-    """Encode a :class:`Seen`."""
     return _packet(FabricKind.SEEN, _NUMBER.pack(number) + topic.encode())
 
 
@@ -153,11 +150,7 @@ def _packet(kind: FabricKind, body: bytes) -> bytes:
 
 
 def parse(packet: bytes) -> Message:
-    """Decode one of the transport's own packets.
-
-    Raises:
-        DecodeError: It is not one of them, or it is damaged.
-    """
+    """Decode one of the transport's own packets."""
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are shorter than the header of {HEADER_SIZE}")
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
@@ -203,11 +196,7 @@ def _topic(text: bytes, least: int = 0) -> str:
 
 
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
-    """Return a copy of bytes received by Zenoh; empty for None.
-
-    Raises:
-        DecodeError: They exceed the maximum size.
-    """
+    """Return a copy of bytes received by Zenoh, unless they exceed the maximum size; empty for None."""
     if data is None:
         return b""
     if len(data) > at_most:
@@ -216,11 +205,7 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
-    """Return a sample's packet and attachment.
-
-    Raises:
-        DecodeError: The packet is empty or too large.
-    """
+    """Return a sample's packet, which must not be empty or too large, and its attachment."""
     if not sample.payload:
         raise DecodeError("it is empty")
     return copied(sample.payload, at_most), copied(sample.attachment, MAX_OWN)
@@ -233,11 +218,7 @@ number = _NUMBER.pack
 
 
 def parse_number(attachment: bytes) -> int:
-    """Decode the attachment of a packet sent to one end.
-
-    Raises:
-        DecodeError: The attachment is damaged.
-    """
+    """Decode the attachment of a packet sent to one end."""
     try:
         return int(_NUMBER.unpack(attachment)[0])
     except struct.error as error:
@@ -250,11 +231,7 @@ def published(run: bytes, count: int) -> bytes:
 
 
 def parse_published(attachment: bytes) -> tuple[bytes, int]:
-    """Decode a published packet's attachment: RUN and number.
-
-    Raises:
-        DecodeError: The attachment is damaged.
-    """
+    """Decode a published packet's attachment: RUN and number."""
     try:
         run, count = _PUBLISHED.unpack(attachment)
     except struct.error as error:
@@ -268,11 +245,7 @@ def frame(run: bytes, count: int, header: bytes) -> bytes:
 
 
 def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
-    """Decode a frame's attachment: RUN, number and header.
-
-    Raises:
-        DecodeError: The attachment is damaged.
-    """
+    """Decode a frame's attachment: RUN, number and header."""
     run, count = parse_published(attachment[: _PUBLISHED.size])
     header = decode(attachment[_PUBLISHED.size :])
     if type(header) is not FrameHeader:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
+from collections.abc import Hashable
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import msgspec
 
@@ -16,7 +18,6 @@ from skyloop.errors import DecodeError, LinkError
 from skyloop.network import layout, packets
 from skyloop.network.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
 from skyloop.network.connection import Publisher, Sender, ServerConnection
-from skyloop.network.handler_queue import HandlerQueue
 from skyloop.network.sealing import Seal, TopicSeal
 from skyloop.network.session import load
 from skyloop.transport.base import NOBODY, Peer, ServerHandler
@@ -32,24 +33,20 @@ CONFIRM_S: Final = 3.0  #: time for an admitted application to declare its token
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
+T = TypeVar("T")
+#: After this number of consecutive commands, handle one other packet, so that endless commands can't stop others from
+#: requesting authority.
+IN_A_ROW: Final = 16
+
 #: Items for the thread that calls the handler: a packet, True for joined, or False for left.
 Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
-    """The connections of one transport server.
+    """The connections of one transport server. Thread-safe, except for :meth:`check`.
 
-    Thread-safe, except for :meth:`check`, which must be called on the handler's thread.
-
-    Args:
-        name: The proxy's name.
-        run: The run of the proxy.
-        ring: The proxy's keys; None without keys.
-        topic_keys: The seal for published packets; None without keys.
-        publisher: The subscriptions.
-        sender: Sends packets to individual applications.
-        queue: The queue for the thread that calls the handler.
-        excused_s: Time to wait beyond :data:`STALLED_S` before disconnecting a silent application [s].
+    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: time to wait beyond :data:`STALLED_S` before
+    disconnecting a silent application [s].
     """
 
     def __init__(
@@ -112,11 +109,7 @@ class ConnectionRegistry:
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
-        """Return the connection that a key belongs to.
-
-        Raises:
-            DecodeError: No connection has this id and identity.
-        """
+        """Return the connection that a key belongs to; :class:`DecodeError` if none has this id and identity."""
         connection = self._connections.get(sender.id)
         if connection is None or connection.who != sender.who:
             raise DecodeError("it is not connected")
@@ -182,11 +175,7 @@ class ConnectionRegistry:
                 self._send_topic_key(connection, self._topic_keys.newest)
 
     def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
-        """Check the keys in a request.
-
-        Raises:
-            LinkError: The application has no key for this drone.
-        """
+        """Check the keys in a request."""
         if self._ring is not None and sender.who in self._ring.shut_out:
             raise LinkError(_SHUT_OUT)
         newest = self._topic_keys.newest if self._topic_keys else None
@@ -204,8 +193,7 @@ class ConnectionRegistry:
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
-            problem = self._no_place(sender.who)
-            if problem:
+            if problem := self._no_place(sender.who):
                 self._turn_away(f"{address} was not admitted: {problem}")
                 return problem
             self._last_id += 1
@@ -218,10 +206,7 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no room for another connection of this identity.
-
-        Without keys, only the total number is limited.
-        """
+        """Return why there is no room for another connection; without keys, only the total number is limited."""
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
             return f"fabric:{self._name} already has its maximum of {MAX_CLIENTS} connections" if full else ""
@@ -296,8 +281,7 @@ class ConnectionRegistry:
         """Send a packet that must arrive. Return False if the connection has ended or this ends it. Any thread."""
         if connection.ended:
             return False
-        problem = connection.queue(packet)
-        if problem:
+        if problem := connection.queue(packet):
             self.drop(connection, problem)
             return False
         self._sender.wake(connection)
@@ -316,11 +300,7 @@ class ConnectionRegistry:
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
         """Disconnect an application and drop its unhandled packets. Any thread.
 
-        Args:
-            connection: The application's connection.
-            reason: The reason, which is sent to the application.
-            forget: Whether to remove the connection at once; otherwise it is removed when the application answers or
-                its token disappears.
+        With ``forget=False``, the connection is removed when the application answers or its token disappears.
         """
         self._hang_up(connection, reason)
         connection.ended = True
@@ -348,3 +328,89 @@ class ConnectionRegistry:
         if not connection.ended:
             connection.reason = connection.reason or reason
             self.send_own(connection, packets.bye(reason))
+
+
+# The queue for the thread that calls the handler -------------------------------------------------------------------
+
+
+class _TurnQueue(Generic[T]):
+    """One queue per connection; the connections take turns, so that one with many items doesn't delay the others."""
+
+    def __init__(self) -> None:
+        self._order: deque[Hashable] = deque()
+        self._waiting: dict[Hashable, deque[T]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._order)
+
+    def count(self, of: Hashable) -> int:
+        return len(self._waiting.get(of, ()))
+
+    def put(self, of: Hashable, item: T) -> None:
+        waiting = self._waiting.get(of)
+        if waiting is None:
+            self._waiting[of] = deque((item,))
+            self._order.append(of)
+        else:
+            waiting.append(item)
+
+    def get(self) -> T:
+        of = self._order.popleft()
+        waiting = self._waiting[of]
+        item = waiting.popleft()
+        if waiting:
+            self._order.append(of)
+        else:
+            del self._waiting[of]
+        return item
+
+
+class HandlerQueue(Generic[T]):
+    """The queue for the thread that calls a handler: commands come first, and connections take turns.
+
+    Items of equal urgency from one connection stay in order.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._urgent: _TurnQueue[T] = _TurnQueue()
+        self._others: _TurnQueue[T] = _TurnQueue()
+        self._in_a_row = 0
+        self._closed = False
+
+    def put(self, of: Hashable, item: T, *, urgent: bool = False, at_most: int | None = None) -> bool:
+        """Queue a connection's item, urgent ones first; refuse it if ``at_most`` are waiting. Any thread."""
+        with self._changed:
+            queue = self._urgent if urgent else self._others
+            if at_most is not None and queue.count(of) >= at_most:
+                return False
+            queue.put(of, item)
+            self._changed.notify()
+            return True
+
+    def waiting(self, of: Hashable) -> int:
+        """Return how many of a connection's non-urgent items are queued."""
+        with self._changed:
+            return self._others.count(of)
+
+    def close(self) -> None:
+        """Stop :meth:`get` from waiting; it still returns items already queued."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> T | None:
+        """Return the next item, or None after the time-out or if the queue is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
+            if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):
+                self._in_a_row += 1
+                return self._urgent.get()
+            self._in_a_row = 0
+            return self._others.get() if self._others else None
+
+    @property
+    def over(self) -> bool:
+        """Whether the queue is closed and empty."""
+        with self._changed:
+            return self._closed and not self._urgent and not self._others

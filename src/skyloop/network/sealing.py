@@ -61,13 +61,7 @@ class Seal:
         self._numbers = itertools.count(1)
 
     def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
-        """Seal a packet; return the payload and the attachment to send. Any thread.
-
-        Args:
-            where: The key by which it will be sent.
-            attachment: Sent along with the packet, authenticated but not encrypted.
-            data: The packet.
-        """
+        """Return payload and attachment of a packet sent by the key ``where``; the attachment is only authenticated."""
         trailer = _TRAILER.pack(self.generation, next(self._numbers))
         attachment += trailer
         return self._cipher.encrypt(trailer, data, _bound(where, attachment)), attachment
@@ -92,8 +86,7 @@ class Open:
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
         """Return the packet and its attachment, or None if it is a repeat or can't be opened yet.
 
-        Raises:
-            DecodeError: The packet did not come from the other end.
+        Raises :class:`DecodeError` if the packet did not come from the other end.
         """
         trailer = attachment[-TRAILER:]
         if len(trailer) < TRAILER:
@@ -115,14 +108,7 @@ class Open:
 
 
 def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """Open a sample like :meth:`Open.open`, but don't copy one that is too large.
-
-    Returns:
-        The packet and the attachment; None if it is a repeat or can't be opened yet.
-
-    Raises:
-        DecodeError: The sample did not come from the other end, or is empty or too large.
-    """
+    """Open a sample like :meth:`Open.open`, but don't copy one that is too large, and refuse one that is empty."""
     payload, attachment = packets.contents(sample, MAX_PACKET + opener.tag)
     opened = opener.open(str(sample.key_expr), attachment, payload)
     if opened is not None and not 0 < len(opened[0]) <= MAX_PACKET:

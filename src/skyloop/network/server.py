@@ -19,8 +19,7 @@ from skyloop.messages import FrameHeader
 from skyloop.network import discovery, layout, packets
 from skyloop.network.config import FabricSettings, Part
 from skyloop.network.connection import MAX_WAITING, Publisher, Sender, ServerConnection
-from skyloop.network.handler_queue import HandlerQueue
-from skyloop.network.registry import ConnectionRegistry, Item
+from skyloop.network.registry import ConnectionRegistry, HandlerQueue, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
 from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
@@ -41,16 +40,7 @@ class FabricServer(TransportServer):
     """A proxy's end, which applications find on the network by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a reachable proxy already has the name, and :class:`LinkError` if
-    joining the network fails.
-
-    Args:
-        name: The proxy's name.
-        settings: How to join the network; by default by multicast, without keys.
-        vehicle: The vehicle's address, which is sent to anyone who searches for the proxy.
-
-    Raises:
-        UsageError: The name is invalid, or the keys don't permit serving it.
-        MissingExtraError: The extra ``network`` is not installed.
+    joining the network fails. ``vehicle``: the vehicle's address, which is sent to anyone who searches for the proxy.
     """
 
     def __init__(self, name: str, settings: FabricSettings | None = None, *, vehicle: str = "") -> None:
@@ -156,15 +146,14 @@ class FabricServer(TransportServer):
 
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
         check_frame(header, pixels)
-        return self._publisher.publish_frame(header, pixels)
+        return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
         """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        connection = self._registry.of_peer(peer)
-        if connection is not None:
+        if (connection := self._registry.of_peer(peer)) is not None:
             self._registry.disconnect(connection, reason)
 
     @property
@@ -195,21 +184,14 @@ class FabricServer(TransportServer):
 
     def _put_to(self, connection: ServerConnection, packet: bytes, number: int) -> bool:
         """Send a packet to one application. Called on the sender's thread."""
-        z, session = load(), self._session
+        session = self._session
         if session is None:
             return False
         key = layout.to(self._name, connection.id)
-        payload, attachment = connection.admission.sealer.seal(key, packets.number(number), packet)
+        sealed = connection.admission.sealer.seal(key, packets.number(number), packet)
         try:
-            session.zenoh.put(
-                key,
-                payload,
-                attachment=attachment,
-                congestion_control=z.CongestionControl.DROP,
-                priority=z.Priority.DATA_HIGH,
-                express=True,
-            )
-        except z.ZError as error:
+            session.put(key, *sealed, "DATA_HIGH")
+        except load().ZError as error:
             _log.debug("%s: not sent to %s: %s", self.address, connection.peer.address, error)
             return False
         return True
@@ -224,7 +206,6 @@ class FabricServer(TransportServer):
             query.reply(layout.info(self._name), packets.encode_own(about))
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet from an application."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
             connection = self._registry.of_sender(sender)

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.network import config
@@ -31,15 +31,11 @@ _BORROWED_S: Final = 0.001  # … and the pause between them
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
 _ATTEMPTS: Final = 5  # attempts to get a free port before another process takes it
+Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: Zenoh's priorities in use, highest first
 
 
 class Session:
-    """A shared Zenoh session; give it back with :func:`release`.
-
-    Raises:
-        LinkError: Joining the network failed.
-        MissingExtraError: The extra ``network`` is not installed.
-    """
+    """A shared Zenoh session; give it back with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
@@ -52,13 +48,25 @@ class Session:
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """Wrap a function that Zenoh calls on its receiving thread for each sample, reply or query.
-
-        The function must return quickly.
-        """
+        """Wrap a function that Zenoh calls on its thread for each sample, reply or query; it must return quickly."""
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
+
+    def put(self, key: str, payload: bytes, attachment: bytes, priority: Priority) -> None:
+        """Send a packet; it is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
+        z = load()
+        drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
+        self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
+
+    def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
+        """Declare a publisher; packets are dropped if the path is congested and, by ``best_effort``, never resent."""
+        z = load()
+        reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
+        drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
+        return self.zenoh.declare_publisher(
+            key, congestion_control=drop, priority=level, reliability=reliability, express=True
+        )
 
     def peers(self) -> set[str]:
         """Return the common names in the certificates of all linked nodes; empty without keys."""
@@ -68,10 +76,7 @@ class Session:
             return set()
 
     def shut_out(self) -> frozenset[str]:
-        """Return the linked nodes that the newest roster excludes.
-
-        Zenoh itself still applies the roster with which the session started.
-        """
+        """Return the linked nodes that the newest roster excludes; Zenoh still applies the one from its start."""
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
@@ -108,10 +113,7 @@ def reason_of(error: BaseException) -> str:
 
 
 class _Pool:
-    """All of this process's sessions.
-
-    A thread closes unused sessions, and ends when there are none.
-    """
+    """All of this process's sessions. A thread closes unused ones, and ends when there are none."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -121,13 +123,7 @@ class _Pool:
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
-        """Return a session with these settings, opening one if necessary.
-
-        Raises:
-            LinkError: Joining the network failed.
-            UsageError: An address is invalid.
-            MissingExtraError: The extra ``network`` is not installed.
-        """
+        """Return a session with these settings, opening one if necessary."""
         with self._changed:
             if self._over:
                 raise LinkError("the network can't be joined: this process is exiting")
@@ -221,11 +217,7 @@ atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:
-    """Import the package zenoh and return it.
-
-    Raises:
-        MissingExtraError: The package is not installed.
-    """
+    """Import the package zenoh and return it; without it, raise :class:`MissingExtraError`."""
     try:
         import zenoh
     except ImportError as error:
@@ -241,10 +233,8 @@ def host_name() -> str:
 def renewed(session: Session) -> Session:
     """Replace a session that has no other users by one at the same addresses with the newest roster.
 
-    All its links are closed and re-established.
-
-    Raises:
-        LinkError: The keys were revoked, or an address does not become free again within :data:`REOPEN_S`.
+    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
+    not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)

@@ -17,9 +17,9 @@ from skyloop.clock import NS_PER_S, Clock, seconds
 from skyloop.errors import shortened
 from skyloop.messages import Command, Event, EventKind, Failsafe, Refusal, Severity, Value, encode
 from skyloop.proxy.core import authority
+from skyloop.proxy.core.airspace import Clamp
 from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
 from skyloop.proxy.core.flight import BELIEF_NS, Changed, Whose
-from skyloop.proxy.core.settings import Clamp
 from skyloop.transport.base import EVENTS, Peer
 from skyloop.zones import THINNEST_M, ZONES, Space
 
@@ -62,11 +62,7 @@ class EventPublisher:
     """Numbers and publishes the events of one run. Thread-safe; never raises."""
 
     def __init__(
-        self,
-        publish: Callable[[str, bytes], int],
-        clock: Clock,
-        counters: Counters,
-        scrub: Callable[[str], str] = str,
+        self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters, scrub: Callable[[str], str] = str
     ) -> None:
         """Initialise; ``scrub`` removes secrets from a text."""
         self._scrub = scrub
@@ -89,7 +85,6 @@ class EventPublisher:
         app: str | None = None,
         data: dict[str, Value] | None = None,
     ) -> None:
-        """Publish one event."""
         with self._lock:
             self._send([EventDraft(kind, text, severity, app, data or {})])
 
@@ -143,8 +138,7 @@ class EventPublisher:
             self._counts["events.published"] += 1
             self._counts[f"events.of.{kind.value}"] += 1
         for packet in packets:
-            missed = self._publish(EVENTS, packet)
-            if missed:
+            if missed := self._publish(EVENTS, packet):
                 self._missed += missed
                 self._counts["events.missed"] += missed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import msgspec
@@ -38,18 +39,12 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.fields import LATEST_NS
+from skyloop.proxy.core.airspace import AirspaceSettings
+from skyloop.proxy.core.autopilot import AutopilotSettings, ReturnSettings
 from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
-from skyloop.proxy.core.failsafe import REASONS
+from skyloop.proxy.core.failsafe import REASONS, FailsafeSettings
 from skyloop.proxy.core.flight import Snapshot, Whose
-from skyloop.proxy.core.settings import FlightSettings
-from skyloop.proxy.events import (
-    EventDraft,
-    emergency_event,
-    name_of,
-    refused_event,
-    taken_event,
-    thin_zones_event,
-)
+from skyloop.proxy.events import EventDraft, emergency_event, name_of, refused_event, taken_event, thin_zones_event
 from skyloop.proxy.requests import Session
 from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
@@ -57,6 +52,19 @@ from skyloop.transport.base import COMMANDS
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
 #: Echo of a command without a new effect, because it was refused or held.
 _NOTHING: Final = Idle()
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSettings:
+    """All settings that follow from parameters."""
+
+    airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
+    failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
+    autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
+    returns: ReturnSettings = field(default_factory=ReturnSettings)
+    max_age_ns: int = 0  #: maximum age of a command [ns]
+    authority_timeout_ns: int = 0
+    authority_ask_ns: int = 0
 
 
 class CommandHandler(FlightSupervisor):
@@ -78,15 +86,6 @@ class CommandHandler(FlightSupervisor):
             self.ladder.settings = settings.failsafe
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
-
-    def aged(self, command: Command, now_ns: int) -> Command:
-        """Return a command with its true age; after a sleep of the computer, an old command looks as if just sent."""
-        if self._slept() - self._slept_seen >= SLEEP_NS:
-            with self._lock:
-                self._observe_sleep(now_ns)
-        if command.sent_ns >= self._awake_ns:
-            return command
-        return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
 
     def problem_with_ceiling(self, altitude: float) -> str:
         """Return why ``limits.altitude`` must not be lowered to this height [m] now, as text; empty if it may."""
@@ -204,6 +203,12 @@ class CommandHandler(FlightSupervisor):
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and execute it, on the receiving thread."""
+        # Give it its true age: after a sleep of the computer, an old command looks as if just sent.
+        if self._slept() - self._slept_seen >= SLEEP_NS:
+            with self._lock:
+                self._observe_sleep(now_ns)
+        if command.sent_ns < self._awake_ns:
+            command = msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
         with self._lock:
             if type(command.action) is EmergencyStop:
                 applied, applied_ns = self._stop_motors(session, command, now_ns)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import msgspec
 
-from skyloop.clock import NS_PER_S, Clock, seconds
+from skyloop.clock import NS_PER_S, Clock, nanoseconds, seconds
 from skyloop.drivers.base import Driver
 from skyloop.errors import DriverError, ParameterError, UnknownNameError
 from skyloop.messages import (
@@ -34,12 +35,14 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import MAX_BODY
 from skyloop.messages.parameter import CHECKUP, encode_checkup
-from skyloop.proxy.core.settings import FlightSettings
+from skyloop.proxy.core.airspace import AirspaceSettings, Limits
+from skyloop.proxy.core.autopilot import AutopilotSettings, ReturnSettings
+from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.events import EventPublisher
-from skyloop.proxy.handler import CommandHandler
+from skyloop.proxy.handler import CommandHandler, FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.requests import Session
-from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written
+from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
 MAX_TEXT: Final = 1024  #: characters in a text value
 MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
@@ -186,10 +189,7 @@ def _number(parameter: Parameter, number: float) -> float:
 
 
 def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return checked values for the proxy's own parameters.
-
-    Raises :class:`UnknownNameError` for other names, and :class:`ParameterError` for invalid values.
-    """
+    """Return checked values for the proxy's own parameters; :class:`UnknownNameError` for any other name."""
     own = {parameter.name: parameter for parameter in OWN}
     checked: dict[str, Value] = {}
 
@@ -204,6 +204,49 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
     for name, value in checked.items():
         check_written(name, value, number)
     return checked
+
+
+def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
+    """Return the settings with new values; parts without changed parameters stay the same object.
+
+    ``value``: the effective values by name; ``changed``: prefixes of the changed names, such as ``limits``. Raises
+    :class:`ParameterError` if the no-fly zones can't be parsed.
+    """
+    new: dict[str, Any] = {}
+    limits, space = before.airspace.limits, before.airspace.space
+    if "limits" in changed:
+        limits = Limits(**{each.name: value[f"limits.{each.name}"] for each in fields(Limits)})
+    if "safety" in changed:
+        space = space_of(value.__getitem__, value.__getitem__)
+    if not {"limits", "safety"}.isdisjoint(changed):
+        new["airspace"] = AirspaceSettings(limits, space, value["safety.deceleration"], value["safety.reaction_s"])
+    if not {"limits", "autopilot"}.isdisjoint(changed):
+        new["autopilot"] = AutopilotSettings(
+            takeoff_altitude=min(value["autopilot.takeoff_altitude"], limits.altitude),
+            climb=min(value["autopilot.climb"], limits.climb),
+            descent=min(value["autopilot.descent"], limits.climb),
+            velocity_p=value["autopilot.velocity_p"],
+            velocity_i=value["autopilot.velocity_i"],
+            tilt=limits.tilt,
+        )
+    if not {"failsafe", "battery"}.isdisjoint(changed):
+        new["failsafe"] = FailsafeSettings(
+            hover_after_s=value["failsafe.hover_after_s"],
+            land_after_s=value["failsafe.land_after_s"],
+            retry_s=value["failsafe.retry_s"],
+            battery_warn=value["battery.warn"],
+            battery_land=value["battery.land"],
+            battery_return=value["battery.return"],
+            returns=value["failsafe.return"],
+        )
+    if "return" in changed:
+        new["returns"] = ReturnSettings(value["return.height"], value["return.speed"], value["return.land"])
+    if "command" in changed:
+        new["max_age_ns"] = nanoseconds(value["command.max_age_s"])
+    if "authority" in changed:
+        new["authority_timeout_ns"] = nanoseconds(value["authority.timeout_s"])
+        new["authority_ask_ns"] = nanoseconds(value["authority.ask_s"])
+    return replace(before, **new) if new else before
 
 
 class Parameters:
@@ -227,12 +270,7 @@ class Parameters:
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Set values for the proxy's own parameters before it starts.
-
-        If the vehicle has a parameter with the same name, :meth:`write_presets` writes to it.
-
-        Raises :class:`UnknownNameError` and :class:`ParameterError`.
-        """
+        """Set values for the proxy's own parameters before it starts; :meth:`write_presets` writes the vehicle's."""
         for name, value in check_presets(values).items():
             self._own[name] = msgspec.structs.replace(self._own[name], value=value)
             self._presets[name] = value
@@ -290,20 +328,14 @@ class Parameters:
                 self._changed.add(name.partition(".")[0])
 
     def flight_settings(self) -> FlightSettings:
-        """Return the flight settings that follow from the effective values.
-
-        Raises :class:`ParameterError` if the driver's no-fly zones can't be parsed.
-        """
+        """Return the flight settings that follow from the effective values; see :func:`updated_settings`."""
         with self._lock:
-            self._settings = self._settings.updated(self._in_force, self._changed)
+            self._settings = updated_settings(self._settings, self._in_force, self._changed)
             self._changed = set()
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`.
-
-        Raises :class:`UnknownNameError`, :class:`ParameterError`, and the driver's errors.
-        """
+        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`."""
         parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:

@@ -75,19 +75,12 @@ _log = logging.getLogger(__name__)
 
 
 class Proxy:
-    """Owns a driver and its transport server, from :meth:`start` to :meth:`end`; also a context manager.
+    """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
 
-    Args:
-        driver: The vehicle's driver, not yet open.
-        server_end: The end that applications connect to, not yet started.
-        name: The name that applications connect to, 1 to 64 characters.
-        clock: The clock for all its samples [ns].
-        ticker: If False, the caller calls :meth:`tick`, as for many proxies in a process, tests, or simulated time.
-        jobs: Answers requests that may wait for the vehicle; by default on a separate thread.
-        slept: Returns how long the computer has slept in total [ns]; by default the system's, if the clock is.
-
-    Raises:
-        UsageError: The name is empty or too long.
+    Applications connect by ``name``, of 1 to 64 characters; ``clock`` is that of all samples [ns]. ``ticker=False``:
+    the caller calls :meth:`tick`, as for many proxies in a process, tests, or simulated time. ``jobs``: answers
+    requests that may wait for the vehicle; by default on a separate thread. ``slept``: returns how long the computer
+    has slept in total [ns]; by default the system's, if the clock is.
     """
 
     def __init__(
@@ -180,7 +173,7 @@ class Proxy:
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
-        self._command, self._aged = self.handler.command, self.handler.aged
+        self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
         """Write an audit trail; it is closed when the proxy ends. Call before :meth:`start`."""
@@ -241,23 +234,17 @@ class Proxy:
         """End the flight, then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
 
         First, everything except landings and emergency stops is barred permanently, whether or not the vehicle flies.
-        Then a flying vehicle is landed. If it does not land in time, it is left hovering if it can hover without
-        the proxy; otherwise it gets a final set-point of zero speed.
+        Then a flying vehicle is landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it is left
+        hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
 
-        Args:
-            within_s: Time limit for the landing [s]; 0: don't land.
-            reason: The reason, as readable text.
-            hurry: Called several times a second; True ends the wait for the landing. A vehicle that can't hover
-                without the proxy is still landed, however long it takes, because otherwise it would fall.
-            unless_flying: If the vehicle does not land in time, the landing continues, and so does the proxy.
-            hangs: Whether the driver hangs or fails. If so, nothing waits for it, and it is not asked to land or hover:
-                calls that may hang are left to daemon threads, as if the proxy had been killed.
+        ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
+        without the proxy is still landed, however long it takes, because otherwise it would fall. ``unless_flying``: if
+        the vehicle does not land in time, the landing continues, and so does the proxy. ``hangs``: the driver hangs or
+        fails, so nothing waits for it, and it is not asked to land or hover: calls that may hang are left to daemon
+        threads, as if the proxy had been killed.
 
-        Returns:
-            True if no flight of the proxy remains.
-
-        Raises:
-            Exception: The error of a step, once all steps are done. If the driver hangs, errors are logged instead.
+        Returns whether no flight of the proxy remains. Raises the error of a step, once all steps are done; if the
+        driver hangs, errors are logged instead.
         """
         if not self._started or self.ended:
             return True
@@ -311,11 +298,7 @@ class Proxy:
 
     def _abandon(self) -> None:
         """Release resources without waiting for hanging parts; failures go to the log."""
-        parts: tuple[Callable[[], object], ...] = (
-            self.server.stop,
-            self.driver.close,
-            self._requests.stop,
-        )
+        parts: tuple[Callable[[], object], ...] = (self.server.stop, self.driver.close, self._requests.stop)
         threads = [
             threading.Thread(target=self._give_back, args=(part,), name="skyloop-abandoned", daemon=True)
             for part in parts
@@ -358,7 +341,7 @@ class Proxy:
             return
         kind = type(sample)
         if kind is Command:
-            self._command(session, self._aged(sample, now_ns), now_ns)  # type: ignore[arg-type]
+            self._command(session, sample, now_ns)  # type: ignore[arg-type]
         elif isinstance(sample, Request):
             self._requests.handle(session, sample, now_ns)
         elif isinstance(sample, Annotation):
@@ -488,8 +471,7 @@ class Proxy:
     def _greet(self, session: Session, hello: Hello, now_ns: int) -> AnyReply:
         if session.role is not None:
             return Refused(Refusal.PROTOCOL, "Hello was already sent on this connection")
-        full = self.server.admit(session.peer, pilot=hello.role is Role.PILOT)
-        if full:
+        if full := self.server.admit(session.peer, pilot=hello.role is Role.PILOT):
             return Refused(Refusal.BUSY, full)
         session.name, session.role = hello.name, hello.role
         text = f"{hello.name} connected as {hello.role.value} from {session.peer.address}"

@@ -40,12 +40,7 @@ from skyloop.proxy.core.command_checks import NO_INTENT, Intent
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.streams import Streams
 from skyloop.proxy.topics import PREFIX, STREAM_TOPIC, FeedbackVariants, topic_problem
-from skyloop.transport.base import (
-    FEEDBACK,
-    TransportServer,
-    stream,
-    video,
-)
+from skyloop.transport.base import FEEDBACK, TransportServer, stream, video
 
 #: While the vehicle is silent, the proxy publishes its own state (authority, links) at this interval, 4 Hz.
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
@@ -260,26 +255,23 @@ class VehiclePublisher:
         if channels is not None and pixels.nbytes != width * height * channels:
             expected = f"{width} × {height} {encoding.value} is {width * height * channels} bytes"
             self._fail("frame", f"frame of camera {camera} has {pixels.nbytes} bytes, and {expected}")
-        elif self.wants(camera):
+        elif self.wanted_fps(camera) > 0.0:
             if intrinsics is None:
                 intrinsics = self._nominal_intrinsics(camera, width, height)
             header = FrameHeader(
                 camera, seq, captured_ns, self._clock(), width, height, encoding, pixels.nbytes, intrinsics
             )
-            self._hand_on(camera, header, pixels)
+            try:
+                missed = self._publish_frame(header, pixels)
+            except (ValueError, TypeError) as error:
+                self._fail("frame", f"frame of camera {camera} cannot be published: {error}")
+            else:
+                self._counts[f"frames.{camera}.published"] += 1
+                if missed:
+                    self._counts[f"frames.{camera}.missed"] += missed
+                if self.streams.known:
+                    self.streams.frame(header, pixels)
         self._counts[f"frames.{camera}.received"] += 1
-
-    def _hand_on(self, camera: str, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        try:
-            missed = self._publish_frame(header, pixels)
-        except (ValueError, TypeError) as error:
-            self._fail("frame", f"frame of camera {camera} cannot be published: {error}")
-            return
-        self._counts[f"frames.{camera}.published"] += 1
-        if missed:
-            self._counts[f"frames.{camera}.missed"] += missed
-        if self.streams.known:
-            self.streams.frame(header, pixels)
 
     def cameras(self) -> Collection[str]:
         """Return the names of the vehicle's cameras, including undeclared ones that sent frames. Thread-safe."""

@@ -123,10 +123,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """Read a file; return its entries and the number of unreadable lines (for example, cut off by a crash).
-
-    Raises :class:`UsageError` for an unreadable file.
-    """
+    """Return a file's entries and the number of unreadable lines (for example, cut off by a crash)."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
@@ -174,8 +171,7 @@ class AuditTrail:
 
     def note(self, event: Event) -> None:
         """Record an event. Thread-safe."""
-        entry = entry_of(event, self._wall(), self._proxy, self._run)
-        if entry is not None:
+        if (entry := entry_of(event, self._wall(), self._proxy, self._run)) is not None:
             self._queue.put(entry)
 
     def close(self) -> None:
@@ -228,10 +224,7 @@ class FlightRecord:
         self._thread: threading.Thread | None = None
 
     def left_s(self) -> float:
-        """Return for how much longer the flight of an earlier run may turn up [s]; 0 if there is none.
-
-        Call before :meth:`start`.
-        """
+        """Return for how much longer an earlier run's flight may turn up [s]; 0: none. Call before :meth:`start`."""
         try:
             age_s = self._wall() - self.path.stat().st_mtime
             with self.path.open(encoding="utf-8") as file:
@@ -242,7 +235,6 @@ class FlightRecord:
         return LIFE_S - max(0.0, age_s) if believed else 0.0
 
     def start(self) -> None:
-        """Start writing."""
         self._thread = threading.Thread(target=self._run, name="skyloop-flight-record", daemon=True)
         self._thread.start()
 

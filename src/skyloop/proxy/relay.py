@@ -68,8 +68,7 @@ class Relay:
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
         """Relay an annotation to its subscribers; return why it is malformed, or an empty text."""
-        unknown = camera_problem(annotation.camera, self._cameras)
-        if unknown:
+        if unknown := camera_problem(annotation.camera, self._cameras):
             return f"an annotation of an unknown frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
             return f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
@@ -144,8 +143,7 @@ class ProcessorWorkers:
         app_id = session.app_id
         with self._lock:
             before = self._roster.find(app_id, asked.processor)
-            refused = self._refusal(session, asked, new=before is None)
-            if refused is not None:
+            if (refused := self._refusal(session, asked, new=before is None)) is not None:
                 return refused
             self._sessions[app_id] = session
             self._roster.register(app_id, asked, now_ns)
@@ -213,8 +211,7 @@ class ProcessorWorkers:
     # With the lock held ---------------------------------------------------------------------------------------------
 
     def _refusal(self, session: Session, asked: JoinProcessor, *, new: bool) -> Refused | None:
-        unknown = camera_problem(asked.camera, self._cameras)
-        if unknown:
+        if unknown := camera_problem(asked.camera, self._cameras):
             return Refused(Refusal.UNSUPPORTED, unknown)
         conflict = self._roster.conflict(session.app_id, asked)
         if conflict is not None:
@@ -272,7 +269,6 @@ class WorkerRoster:
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        """Add or renew a worker."""
         self._workers[app_id, asked.processor] = Worker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:

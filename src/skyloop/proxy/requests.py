@@ -57,20 +57,6 @@ _log = logging.getLogger(__name__)
 class Session:
     """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
 
-    __slots__ = (
-        "_malformed_ns",
-        "answers",
-        "app_id",
-        "authority_request",
-        "ended",
-        "episodes",
-        "intents",
-        "joined_ns",
-        "name",
-        "peer",
-        "role",
-    )
-
     def __init__(self, peer: Peer, joined_ns: int) -> None:
         self.peer = peer
         self.joined_ns = joined_ns
@@ -94,8 +80,6 @@ class Session:
 
 class Answers:
     """The pending requests of one connection, and the answers stored for repeats. Not thread-safe."""
-
-    __slots__ = ("_forgotten", "_pending", "kept")
 
     def __init__(self) -> None:
         self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request
@@ -146,15 +130,12 @@ class JobThread:
         self._thread = threading.Thread(target=self._run, name="skyloop-requests", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def put(self, job: Callable[[], None]) -> None:
-        """Queue a job."""
         self._jobs.put(job)
 
     def stop(self, timeout_s: float) -> None:
-        """End after the current job."""
         self._jobs.put(None)
         self._thread.join(timeout_s)
 
@@ -197,7 +178,6 @@ class RequestDispatcher:
         self._pending_lock = threading.Lock()
 
     def start(self) -> None:
-        """Start answering deferred requests."""
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:

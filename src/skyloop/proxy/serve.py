@@ -177,23 +177,16 @@ def run(
         # Wake periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
-                _publish_keys(proxies, change)
+                _log.warning("%s", change)
+                for proxy in proxies:
+                    proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
             if parent_fd is None:  # a parent gets the proxy's events, and might not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
 
 
-def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
-    _log.warning("%s", change)
-    for proxy in proxies:
-        proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
-
-
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail.
-
-    Raises :class:`UsageError` if a requested file can't be written; the default file is optional.
-    """
+    """Give a proxy its audit trail; :class:`UsageError` if a requested file can't be written, unlike the default."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -232,13 +225,10 @@ def at_once(
     over: Callable[[K], bool] = lambda _: False,
     daemon: bool = False,
 ) -> None:
-    """End several flights at the same time, and wait for all.
+    """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
-    Args:
-        ends: The functions that end the flights, each run in its own thread; they must not raise.
-        tell: Called with the ones for which there is no thread, before they are run one after another.
-        over: Returns whether to stop waiting for one.
-        daemon: Whether the program may end before they do.
+    ``tell``: called with the ones for which there is no thread, before they are run one after another. ``over``:
+    returns whether to stop waiting for one. ``daemon``: whether the program may end before they do.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
@@ -293,8 +283,7 @@ def _announced(proxy: Proxy) -> LinkLines:
 
 def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
     vehicle = proxy.publisher
-    line = lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns())
-    if line:
+    if line := lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns()):
         _announce(line)
 
 

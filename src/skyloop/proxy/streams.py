@@ -344,8 +344,7 @@ class Streams(Forms[StreamForm]):
 
     def report(self, report: StreamReport) -> str:
         """Handle a subscriber's report; return why it makes no sense, or an empty text."""
-        form = self.find(report.topic)
-        if form is not None:
+        if (form := self.find(report.topic)) is not None:
             form.report(report, self._clock())
             return ""
         return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is not a stream"
@@ -360,7 +359,6 @@ class Streams(Forms[StreamForm]):
             self._counts[f"streams.{camera}.missed"] += missed
 
     def end(self) -> None:
-        """End all threads."""
         for form in self.known:
             form.end()
 
@@ -377,8 +375,7 @@ def _image(picture: _Picture) -> tuple[NDArray[np.uint8], str]:
     if channels is not None:
         shape = (header.height, header.width, 3) if channels == 3 else (header.height, header.width)
         return pixels.reshape(shape), _FORMATS[header.encoding]
-    why_not = why_not_decoded(pixels.data)
-    if why_not:
+    if why_not := why_not_decoded(pixels.data):
         raise UsageError(why_not)
     import cv2
 

@@ -31,13 +31,13 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
+from skyloop.proxy.core.airspace import Clamp
 from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.command_checks import CommandChecks, Intent
 from skyloop.proxy.core.failsafe import BatteryLow, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight import BELIEF_NS, Snapshot, Whose
-from skyloop.proxy.core.settings import Clamp
 from skyloop.proxy.events import (
     UNHEARD,
     Counters,
@@ -142,8 +142,7 @@ class FlightSupervisor:
             self._observe_link(now_ns)
             self._observe_silence(now_ns)
             self._observe_position(now_ns)
-            effects = self.authority.update(now_ns)
-            if effects:
+            if effects := self.authority.update(now_ns):
                 self._apply_authority(effects, now_ns)
             self._update_failsafe(now_ns)
             session = self._holder
@@ -404,8 +403,7 @@ class FlightSupervisor:
 
     def _update_failsafe(self, now_ns: int) -> None:
         """Let the ladder decide and act, and publish the results."""
-        drafts = self._act(now_ns)
-        if drafts:
+        if drafts := self._act(now_ns):
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:

@@ -203,10 +203,7 @@ class OverviewRegistry:
 
 
 class OverviewPublisher:
-    """Publishes the overview on one proxy's transport once a second, while it has subscribers.
-
-    A new subscriber gets an overview at once.
-    """
+    """Publishes the overview on one proxy's transport once a second, and at once to a new subscriber."""
 
     def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
         self.registry = OverviewRegistry()  #: provides the published rows; by default only the proxy's own

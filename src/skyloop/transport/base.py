@@ -74,80 +74,38 @@ NOBODY = Peer(0, "an unknown application")
 
 
 class ServerHandler(Protocol):
-    """The callbacks of a transport server.
-
-    Except for :meth:`topic_problem` they run on the transport's receiving threads, one call at a time.
-    """
+    """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, before its first packet.
-
-        Args:
-            peer: The connection; this object or an equal one identifies it in all later calls.
-        """
+        """Handle a new connection, before its first packet. An equal peer identifies it in all later calls."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet from an application.
-
-        Args:
-            peer: The sender.
-            packet: 1 to :data:`MAX_PACKET` bytes. The transport does not check their content.
-        """
+        """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle the refusal of a packet that the application's keys do not allow, and that is not delivered.
-
-        Args:
-            peer: The sender; :data:`NOBODY` if the connection is unknown.
-            reason: The reason, as readable text.
-        """
+        """Handle a packet that was not delivered because the sender's keys forbid it; :data:`NOBODY`: unknown."""
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to.
+        """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.
 
         May be called on any thread, even while another callback runs, and must answer at once.
-
-        Args:
-            topic: The requested name.
-
-        Returns:
-            Why there is no such topic, and which topics there are; empty if it exists.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Handle an invalid request to the transport itself.
-
-        The application requested an unknown topic, or more topics than allowed.
-
-        Args:
-            peer: The requesting application.
-            reason: The problem, as readable text.
-        """
+        """Handle a request for an unknown topic, or for more topics than allowed; ``reason`` is readable text."""
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """Handle the end of a connection; called once for each ``peer_joined``, after the connection's last packet.
-
-        Args:
-            peer: The connection.
-            reason: The reason, as readable text.
-        """
+        """Handle the end of a connection and its reason, once for each ``peer_joined``, after the last packet."""
 
 
 class TransportServer(ABC):
-    """A proxy's side of a transport.
-
-    Between :meth:`start` and :meth:`stop` all methods may be called from any thread.
-    """
+    """A proxy's side of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
-        """Begin accepting connections.
+        """Begin accepting connections; the handler is called on receiving threads, one call at a time.
 
-        Args:
-            handler: Called on the transport's receiving threads, one call at a time.
-
-        Raises:
-            NameTakenError: A running proxy already uses the name.
+        Raises :class:`NameTakenError` if a running proxy already uses the name.
         """
 
     @abstractmethod
@@ -156,47 +114,18 @@ class TransportServer(ABC):
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send a packet to one application.
-
-        Args:
-            peer: The application, as given to the handler.
-            packet: 1 to :data:`MAX_PACKET` bytes.
-
-        Returns:
-            True if the packet was handed over; False if the application's buffer is full or it is gone.
-
-        Raises:
-            UsageError: The packet is empty or too large.
-        """
+        """Send a packet to one application; return False if its buffer is full or it is gone."""
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to every subscriber of a topic.
-
-        Args:
-            topic: A topic such as :data:`FEEDBACK`.
-            packet: 1 to :data:`MAX_PACKET` bytes.
-
-        Returns:
-            The number of subscribers that did *not* receive it.
-
-        Raises:
-            UsageError: The packet is empty or too large.
-        """
+        """Send a packet to every subscriber of a topic; return the number of those that did *not* receive it."""
 
     @abstractmethod
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Send a frame to every subscriber of its camera.
+        """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
 
-        Args:
-            header: The frame's header.
-            pixels: ``header.size`` bytes, dtype uint8, any shape, C-contiguous; may be reused after the call.
-
-        Returns:
-            The number of subscribers that did *not* receive it.
-
-        Raises:
-            UsageError: The pixels do not match the header.
+        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, else :class:`UsageError` is raised;
+        they may be reused after the call.
         """
 
     @abstractmethod
@@ -204,27 +133,15 @@ class TransportServer(ABC):
         """Return the number of a topic's subscribers; samples need not be produced if there are none."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
-        """Decide whether an application that has identified itself may stay, as some places are reserved for pilots.
+        """Return why an application that has identified itself may not stay; empty if it may, which is the default.
 
-        The default admits every application.
-
-        Args:
-            peer: The application's connection.
-            pilot: Whether it connects as a pilot.
-
-        Returns:
-            Why it may not stay; empty if it may.
+        Some places may be reserved for pilots.
         """
         return ""
 
     @abstractmethod
     def disconnect(self, peer: Peer, reason: str) -> None:
-        """End one connection; ``peer_left`` follows with this reason. Does nothing if it is already gone.
-
-        Args:
-            peer: The application's connection.
-            reason: The reason, as readable text, which the handlers at both ends get.
-        """
+        """End one connection; ``peer_left`` and the application get the reason. Does nothing if it is already gone."""
 
     @property
     def counters(self) -> dict[str, float]:
@@ -243,30 +160,21 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """The callbacks of a transport client.
-
-    They run on the transport's receiving thread, one call at a time.
-    """
+    """A transport client's callbacks: on its receiving thread, one call at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
-        """Handle a frame.
+        """Handle a frame: ``header.size`` bytes, shape (size,), dtype uint8, not writeable.
 
-        Args:
-            header: The frame's header.
-            pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. The handler may keep them, or any
-                view of them, for as long as it likes; that affects only this application.
-            topic: The subscribed topic that the frame belongs to, if :attr:`TransportClient.variants` is true.
+        The handler may keep the pixels, or any view of them, for as long as it likes; that affects only this
+        application. ``topic``: the subscribed topic that the frame belongs to, if :attr:`TransportClient.variants` is
+        true.
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, whichever end closed it. Called once, as the last callback.
-
-        Args:
-            reason: The reason, as readable text.
-        """
+        """Handle the end of the connection, whichever end closed it and why. Called once, as the last callback."""
 
 
 class TransportClient(ABC):
@@ -274,49 +182,26 @@ class TransportClient(ABC):
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the proxy. Any thread.
-
-        Args:
-            packet: 1 to :data:`MAX_PACKET` bytes.
-
-        Returns:
-            True if the packet was handed over.
-
-        Raises:
-            UsageError: The packet is empty or too large.
-        """
+        """Send a packet to the proxy; return whether it was handed over. Any thread."""
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
         """Subscribe to a topic, or unsubscribe from it. Any thread.
 
-        Args:
-            topic: The topic's name, 1 to :data:`MAX_TOPIC` characters.
-            on: True to subscribe, False to unsubscribe.
-
-        Raises:
-            UsageError: The name is empty or too long.
+        Raises :class:`UsageError` unless the name has 1 to :data:`MAX_TOPIC` characters.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection. Idempotent.
-
-        The handler's ``closed`` runs before this returns, except on the receiving thread.
-        """
+        """End the connection. Idempotent. ``closed`` runs before this returns, except on the receiving thread."""
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
         """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.
 
-        Meanwhile the handler runs on this thread, still one call at a time. By default, this is not supported.
-
-        Args:
-            ready: Returns whether the wait is over; called on this thread after each packet and several times a second.
-            wake: Called once, on another thread, when a retry may succeed; unused if this returns True.
-            timeout_s: How long to receive [s]; the call may take 50 ms longer.
-
-        Returns:
-            True if this thread has been receiving; False if another one is, so that the caller must wait as usual.
+        Meanwhile the handler runs on this thread, still one call at a time. Returns False if another thread is
+        receiving, so that the caller must wait as usual; ``wake`` is then called once, on another thread, when a retry
+        may succeed. By default, this is not supported. ``ready`` returns whether the wait is over; it is called on this
+        thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
         """
         return False
 
@@ -361,14 +246,7 @@ NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
 def check_name(name: str) -> None:
-    """Check the name of a proxy.
-
-    Args:
-        name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``, the first one a letter or digit.
-
-    Raises:
-        UsageError: The name is invalid.
-    """
+    """Raise :class:`UsageError` unless this can be the name of a proxy (:data:`NAME`)."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
@@ -377,27 +255,13 @@ def check_name(name: str) -> None:
 
 
 def check_packet(packet: bytes) -> None:
-    """Check the size of a packet.
-
-    Args:
-        packet: 1 to :data:`MAX_PACKET` bytes.
-
-    Raises:
-        UsageError: The packet is empty or too large.
-    """
+    """Raise :class:`UsageError` unless a packet has 1 to :data:`MAX_PACKET` bytes."""
     if not 0 < len(packet) <= MAX_PACKET:
         raise UsageError(f"a packet of {len(packet)} bytes cannot be sent; it must have 1 to {MAX_PACKET}")
 
 
 def check_topic(topic: str) -> None:
-    """Check the length of a topic's name.
-
-    Args:
-        topic: 1 to :data:`MAX_TOPIC` characters.
-
-    Raises:
-        UsageError: The name is empty or too long.
-    """
+    """Raise :class:`UsageError` unless a topic's name has 1 to :data:`MAX_TOPIC` characters."""
     if not 0 < len(topic) <= MAX_TOPIC:
         raise UsageError(f"the topic {topic[:100]!r} has {len(topic)} characters; it must have 1 to {MAX_TOPIC}")
 
@@ -408,15 +272,7 @@ def too_many_topics(topic: str) -> str:
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Check that pixels match their header.
-
-    Args:
-        header: The frame's header.
-        pixels: ``header.size`` bytes, dtype uint8, C-contiguous, in any shape.
-
-    Raises:
-        UsageError: The size, dtype or order differs.
-    """
+    """Raise :class:`UsageError` unless pixels match their header in size, dtype and order."""
     if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
@@ -12,24 +11,11 @@ from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer,
 from skyloop.transport.priority import PriorityLock, is_command
 
 
-class _Member(NamedTuple):
-    """The end that an application is connected to, and its peer there."""
-
-    end: TransportServer
-    peer: Peer
-
-
 class CompositeServer(TransportServer):
-    """One transport server that combines several, and has its own numbers for their peers.
+    """One transport server that combines several, nearest first, and has its own numbers for their peers.
 
     The handler gets one call at a time, as the contract requires: an end that brings a command goes first, the others
     in order of arrival.
-
-    Args:
-        ends: The transport servers, nearest first; at least one.
-
-    Raises:
-        UsageError: ``ends`` is empty.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
@@ -37,17 +23,13 @@ class CompositeServer(TransportServer):
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
         self.lock = PriorityLock()  #: a thread must hold it to call the handler
-        self._members: dict[int, _Member] = {}  # by our number
+        self._members: dict[
+            int, tuple[TransportServer, Peer]
+        ] = {}  # by our number: an application's end and peer there
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start accepting connections at all ends, or at none.
-
-        If an end's ``start`` raises, the ends before it are stopped and the error is re-raised.
-
-        Args:
-            handler: Called by one end at a time, on that end's receiving threads.
-        """
+        """Start accepting connections at all ends or, if an end's ``start`` raises, at none."""
         started: list[TransportServer] = []
         try:
             for end in self._ends:
@@ -75,7 +57,8 @@ class CompositeServer(TransportServer):
         if member is None:
             check_packet(packet)
             return False
-        return member.end.send(member.peer, packet)
+        end, theirs = member
+        return end.send(theirs, packet)
 
     def publish(self, topic: str, packet: bytes) -> int:
         return sum(end.publish(topic, packet) for end in self._ends)
@@ -88,12 +71,11 @@ class CompositeServer(TransportServer):
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:
         member = self._members.get(peer.id)
-        return "" if member is None else member.end.admit(member.peer, pilot=pilot)
+        return "" if member is None else member[0].admit(member[1], pilot=pilot)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        member = self._members.get(peer.id)
-        if member is not None:
-            member.end.disconnect(member.peer, reason)
+        if (member := self._members.get(peer.id)) is not None:
+            member[0].disconnect(member[1], reason)
 
     @property
     def counters(self) -> dict[str, float]:
@@ -112,18 +94,10 @@ class CompositeServer(TransportServer):
         return ", ".join(end.address for end in self._ends)
 
     def enter(self, end: TransportServer, peer: Peer) -> Peer:
-        """Register an end's peer under a number of this server. The caller holds the lock.
-
-        Args:
-            end: The end that the application connected to.
-            peer: The application's peer at that end.
-
-        Returns:
-            The peer to pass to the handler.
-        """
+        """Give an end's peer a number of this server; return it as the handler knows it. The caller holds the lock."""
         self._last_id += 1
         ours = Peer(self._last_id, peer.address)
-        self._members[ours.id] = _Member(end, peer)
+        self._members[ours.id] = end, peer
         return ours
 
     def leave(self, peer: Peer) -> None:
@@ -147,8 +121,11 @@ class _EndHandler:
             self._handler.peer_joined(ours)
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        with self._lock.urgent if is_command(packet) else self._lock:
+        self._lock.acquire(is_command(packet))
+        try:
             self._handler.packet(self._peers[peer.id], packet)
+        finally:
+            self._lock.release()
 
     def refused(self, peer: Peer, reason: str) -> None:
         with self._lock:

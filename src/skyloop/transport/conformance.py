@@ -24,16 +24,7 @@ from functools import partial
 import numpy as np
 
 from skyloop.errors import LinkError, UsageError
-from skyloop.transport.base import (
-    FEEDBACK,
-    MAX_PACKET,
-    MAX_TOPIC,
-    Dialer,
-    Peer,
-    Pixels,
-    TransportServer,
-    video,
-)
+from skyloop.transport.base import FEEDBACK, MAX_PACKET, MAX_TOPIC, Dialer, Peer, Pixels, TransportServer, video
 from skyloop.transport.testing import (
     FRONT,
     ClientLog,
@@ -48,10 +39,7 @@ from skyloop.transport.testing import (
 
 
 class TransportSuite(ABC):
-    """The contract in :mod:`skyloop.transport.base` as tests.
-
-    A subclass implements :meth:`make_server` and :meth:`dialer`; pytest collects the inherited tests.
-    """
+    """The contract in :mod:`skyloop.transport.base` as tests; pytest collects those that a subclass inherits."""
 
     @abstractmethod
     def make_server(self) -> TransportServer:
@@ -59,14 +47,10 @@ class TransportSuite(ABC):
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
-        """Return a dialer that connects to a transport server.
+        """Return a dialer to a server from :meth:`make_server`, whether started or not.
 
-        Args:
-            server: An end from :meth:`make_server`, whether started or not.
-
-        Returns:
-            A dialer that raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the
-            server does not run.
+        It raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the server does
+        not run.
         """
 
     @contextmanager
@@ -81,14 +65,7 @@ class TransportSuite(ABC):
 
     @contextmanager
     def connected(self, server: TransportServer, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
-        """Yield a client that has joined and subscribed; close it at the end.
-
-        Args:
-            server: A started server.
-            log: The log of its handler.
-            *topics: The client's topics.
-            keep: Whether the client's log keeps frames (see :class:`skyloop.transport.testing.ClientLog`).
-        """
+        """Yield a client that has joined and subscribed; close it at the end. ``keep``: its log keeps frames."""
         client_log = ClientLog(keep=keep)
         known = len(log.joined)
         before = {topic: server.subscribers(topic) for topic in topics}
@@ -283,10 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial, and turn a ``UsageError`` into a ``LinkError``.
-
-        An unknown name is just as valid as a refused connection.
-        """
+        """Dial; an unknown name (``UsageError``) is just as valid as a refused connection, and raises ``LinkError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:
@@ -312,11 +286,7 @@ class TransportSuite(ABC):
         assert len(log.left) == 1
 
     def test_disconnect_tells_both_ends_why(self) -> None:
-        with (
-            self.serving() as (server, log),
-            self.connected(server, log) as app,
-            self.connected(server, log) as other,
-        ):
+        with self.serving() as (server, log), self.connected(server, log) as app, self.connected(server, log) as other:
             server.disconnect(app.peer, "because of this")
             wait_until(lambda: app.log.closings and log.left, "both ends were notified")
             assert log.left == [(app.peer, "because of this")]

@@ -15,21 +15,10 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
-    """Encode a frame as requested.
+    """Encode a frame as requested; return the header that describes the result, and its bytes.
 
-    A frame that is already a JPEG is returned unchanged, regardless of the request.
-
-    Args:
-        header: The frame's header.
-        pixels: ``header.size`` bytes, dtype uint8.
-        request: Scale, encoding and quality of the result.
-
-    Returns:
-        The header that describes the result, and its bytes.
-
-    Raises:
-        MissingExtraError: OpenCV is needed but not installed.
-        LinkError: OpenCV could not encode the frame as JPEG.
+    A frame that is already a JPEG is returned unchanged, regardless of the request. Raises :class:`MissingExtraError`
+    if OpenCV is needed but not installed, and :class:`LinkError` if it could not encode the frame.
     """
     channels = _CHANNELS.get(header.encoding)
     if channels is None or (request.encoding == "raw" and request.scale == 1.0):
@@ -50,29 +39,12 @@ def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> 
 
 
 def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
-    """Return the header of a scaled-down frame, with matching intrinsics.
-
-    Args:
-        header: The frame's header.
-        scale: The factor for width and height.
-
-    Returns:
-        The header, whose ``size`` is that of plain pixels.
-    """
+    """Return the header of a scaled-down frame as plain pixels, with matching intrinsics."""
     return resized_header(header, max(1, round(header.width * scale)), max(1, round(header.height * scale)))
 
 
 def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
-    """Return the header of a scaled-down frame, with matching intrinsics.
-
-    Args:
-        header: The frame's header.
-        width: New width [px].
-        height: New height [px].
-
-    Returns:
-        The header, whose ``size`` is that of plain pixels.
-    """
+    """Return the header of a frame resized to these pixels, as plain pixels, with matching intrinsics."""
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
@@ -85,18 +57,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
 
 
 def resized(picture: Any, header: FrameHeader) -> Any:
-    """Resize a picture by averaging areas.
-
-    Args:
-        picture: Shape (height, width, channels), dtype uint8.
-        header: A header with the new width and height [px].
-
-    Returns:
-        The resized picture, shape (height, width, channels).
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    """Resize a picture of shape (height, width, channels) to the header's size by averaging areas, with OpenCV."""
     size = (header.width, header.height)
     return _opencv().resize(picture, size, interpolation=_opencv().INTER_AREA).reshape(header.height, header.width, -1)
 

@@ -11,7 +11,7 @@ import itertools
 import logging
 import threading
 from collections import deque
-from enum import Enum, auto
+from collections.abc import Callable
 from queue import SimpleQueue
 
 import numpy as np
@@ -43,25 +43,12 @@ _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-class _What(Enum):
-    """What happened to a client, as reported to the server's receiving thread."""
-
-    JOINED = auto()
-    PACKET = auto()
-    MALFORMED = auto()
-    LEFT = auto()
-
-
-_Item = tuple["MemoryClient", _What, str]  # the text describes a malformed request
+#: A client, and what its server's receiving thread has to tell the handler.
+_Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop.
-
-    Args:
-        name: Name used in its address and for its threads.
-        faults: Faults to inject; none by default.
-    """
+    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -74,23 +61,13 @@ class MemoryServer(TransportServer):
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect to this server.
-
-        Args:
-            handler: Called on the client's own receiving thread.
-
-        Returns:
-            The connected transport client.
-
-        Raises:
-            LinkError: The server has not been started.
-        """
+        """Connect to this server, which must be running. The handler runs on the client's own receiving thread."""
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"{self.address} has no server: start the transport server first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
-            self._inbox.put((client, _What.JOINED, ""))
+            self._inbox.put((client, lambda handler: handler.peer_joined(client.peer)))
         client.begin()
         return client
 
@@ -136,8 +113,7 @@ class MemoryServer(TransportServer):
         return len(self._subscribed(topic))
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        client = self._clients.get(peer.id)
-        if client is not None:
+        if (client := self._clients.get(peer.id)) is not None:
             self.end(client, reason, muted=True)
 
     @property
@@ -146,7 +122,7 @@ class MemoryServer(TransportServer):
 
     def arrived(self, client: MemoryClient) -> None:
         """Wake the receiving thread for a packet in the client's ``outgoing``."""
-        self._inbox.put((client, _What.PACKET, ""))
+        self._inbox.put((client, client.pass_on))
 
     def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
         """Return whether a client may subscribe to a topic; if not, call the handler's ``malformed``."""
@@ -154,42 +130,26 @@ class MemoryServer(TransportServer):
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
         if problem:
-            self._inbox.put((client, _What.MALFORMED, problem))
+            self._inbox.put((client, lambda handler: client.report(handler, problem)))
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection. Idempotent.
-
-        Args:
-            client: The connection's client.
-            reason: The reason, for both ends' handlers.
-            muted: Whether to drop the client's undelivered packets.
-        """
+        """End a connection; ``muted``: drop the client's undelivered packets. Idempotent."""
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
                 return
             client.muted = muted
             client.end(reason)
-            self._inbox.put((client, _What.LEFT, ""))
+            self._inbox.put((client, lambda handler: handler.peer_left(client.peer, client.reason)))
 
     def _subscribed(self, topic: str) -> list[MemoryClient]:
         return [client for client in list(self._clients.values()) if topic in client.topics]
 
     def _receive(self, handler: ServerHandler, inbox: SimpleQueue[_Item | None]) -> None:
         while (item := inbox.get()) is not None:
-            client, what, text = item
+            client, tell = item
             try:
-                if what is _What.PACKET:
-                    packet = client.outgoing.popleft()
-                    if not client.muted:
-                        handler.packet(client.peer, packet)
-                elif what is _What.MALFORMED:
-                    if not client.muted:
-                        handler.malformed(client.peer, text)
-                elif what is _What.JOINED:
-                    handler.peer_joined(client.peer)
-                else:
-                    handler.peer_left(client.peer, client.reason)
+                tell(handler)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
                 _log.exception("the server's handler failed; the connection to %s ends", client.peer.address)
                 self.end(client, f"the server's handler failed: {error!r}", muted=True)
@@ -220,6 +180,17 @@ class MemoryClient(TransportClient):
     def begin(self) -> None:
         """Start the receiving thread."""
         self._thread.start()
+
+    def pass_on(self, handler: ServerHandler) -> None:
+        """Give the server's handler the next outgoing packet."""
+        packet = self.outgoing.popleft()
+        if not self.muted:
+            handler.packet(self.peer, packet)
+
+    def report(self, handler: ServerHandler, problem: str) -> None:
+        """Tell the server's handler about a malformed request."""
+        if not self.muted:
+            handler.malformed(self.peer, problem)
 
     def send(self, packet: bytes) -> bool:
         check_packet(packet)
@@ -263,11 +234,7 @@ class MemoryClient(TransportClient):
         return True
 
     def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
-        """Queue a frame from the server.
-
-        Returns:
-            False if it replaced a waiting frame, or if the connection has ended.
-        """
+        """Queue a frame from the server; return False if it replaced a waiting frame, or the connection has ended."""
         room = True
         with self._down_lock:
             if self._ended:

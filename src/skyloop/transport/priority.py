@@ -15,7 +15,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from enum import IntEnum
-from types import TracebackType
 from typing import Final
 
 from skyloop.errors import DecodeError
@@ -44,11 +43,7 @@ class Lane(IntEnum):
 
 
 class PacketBacklog:
-    """Holds the waiting packets of one connection. Not thread-safe.
-
-    Args:
-        most: Maximum number of waiting packets.
-    """
+    """Holds the waiting packets of one connection, at most ``most``. Not thread-safe."""
 
     __slots__ = ("_bytes", "_idle", "_last", "_most", "_number", "_set_point", "_waiting")
 
@@ -136,7 +131,7 @@ def _command(packet: bytes) -> Command | None:
 class PriorityLock:
     """A re-entrant lock that each holder hands to the next waiter.
 
-    ``with lock:`` waits behind all others, ``with lock.urgent:`` only behind other urgent waiters.
+    ``with lock:`` waits behind all others, ``lock.acquire(urgent=True)`` only behind other urgent waiters.
     """
 
     def __init__(self) -> None:
@@ -146,14 +141,9 @@ class PriorityLock:
         self._queues = threading.Lock()  # guards the queues
         self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiters, each with a lock to wake it
         self._others: deque[tuple[threading.Lock, int]] = deque()
-        self.urgent = _Urgent(self)
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock and acquire it; the owner may acquire it again.
-
-        Args:
-            urgent: Whether to go before all non-urgent waiters.
-        """
+        """Wait for the lock, if ``urgent`` before all waiters that are not; the owner may acquire it again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me
@@ -168,11 +158,8 @@ class PriorityLock:
         self._hand_over()  # it may have been released since the first attempt
         woken.acquire()  # the releaser has made this thread the owner
 
-    def release(self) -> None:
-        """Release the lock once; the last release hands it over.
-
-        Only the owning thread may call this; that is not checked.
-        """
+    def release(self, *_: object) -> None:
+        """Release the lock once, as its owner (not checked); the last release hands it over."""
         if self._depth:
             self._depth -= 1
             return
@@ -199,25 +186,5 @@ class PriorityLock:
         """Number of waiting threads."""
         return len(self._urgent) + len(self._others)
 
-    def __enter__(self) -> None:
-        self.acquire()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.release()
-
-
-class _Urgent:
-    """The context manager behind :attr:`PriorityLock.urgent`."""
-
-    def __init__(self, lock: PriorityLock) -> None:
-        self._lock = lock
-
-    def __enter__(self) -> None:
-        self._lock.acquire(urgent=True)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._lock.release()
+    __enter__ = acquire
+    __exit__ = release

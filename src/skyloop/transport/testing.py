@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -22,15 +22,7 @@ FRONT: Final = "front"
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Return as soon as a condition holds.
-
-    Args:
-        condition: Called about every millisecond until it returns something true.
-        what: Description of the condition, for the error message.
-
-    Raises:
-        AssertionError: The condition did not hold within :data:`PATIENCE_S`.
-    """
+    """Return as soon as a condition holds, which is tested every millisecond; fail after :data:`PATIENCE_S`."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, f"after {PATIENCE_S} s still not true: {what}"
@@ -38,15 +30,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def raises(error: type[Exception], call: Callable[[], object]) -> None:
-    """Check that a call raises an error; an error of another type passes through.
-
-    Args:
-        error: The type of the error.
-        call: A function without arguments.
-
-    Raises:
-        AssertionError: The call returned.
-    """
+    """Check that a call raises an error; an error of another type passes through."""
     try:
         call()
     except error:
@@ -98,9 +82,8 @@ class ServerLog:
 class ClientLog:
     """A client's handler that records its calls.
 
-    Args:
-        keep: Whether to keep the frames, with their pixels, in ``frames``. If false, the pixels are compared with
-            :func:`picture` at once, and ``torn`` lists the numbers of frames that differ.
+    With ``keep=False``, a frame's pixels are compared with :func:`picture` at once rather than kept, and ``torn`` lists
+    the numbers of frames that differ.
     """
 
     def __init__(self, *, keep: bool = True) -> None:
@@ -142,31 +125,20 @@ def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> 
 
 
 def picture(head: FrameHeader) -> Pixels:
-    """Return the pixels of a frame for tests; each byte depends on the frame's number.
-
-    Args:
-        head: The frame's header.
-
-    Returns:
-        ``head.size`` bytes, shape (size,), dtype uint8.
-    """
+    """Return the pixels of a frame for tests, as bytes; each byte depends on the frame's number."""
     return (np.arange(head.size, dtype=np.uint32) * 7 + head.seq * 31).astype(np.uint8)
 
 
-class Joined:
+class Joined(NamedTuple):
     """A transport client that has joined, its log, and its :class:`Peer` at the server."""
 
-    def __init__(self, client: TransportClient, log: ClientLog, peer: Peer) -> None:
-        self.client = client
-        self.log = log
-        self.peer = peer
+    client: TransportClient
+    log: ClientLog
+    peer: Peer
 
 
 def resources() -> tuple[int, int]:
-    """Return the number of threads and, where ``/proc`` shows it, open descriptors of this process.
-
-    The garbage collector runs first.
-    """
+    """Return the number of threads and, from ``/proc``, open descriptors of this process, after collecting garbage."""
     gc.collect()
     descriptors = Path("/proc/self/fd")
     return threading.active_count(), len(list(descriptors.iterdir())) if descriptors.exists() else 0

@@ -1,4 +1,4 @@
-"""Reading an identity's folder: every fault and every near expiry is reported."""
+"""Reading an identity's folder: every fault and every near expiry is reported; writing one leaves nothing half done."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ed25519
 
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.network.keys import Lab, load
-from skyloop.network.keys.credentials import expiry_warning
+from skyloop.network.keys.credentials import expiry_warning, make_directory, write
 from skyloop.network.keys.identity import make_identity
 from tests.network.keys.conftest import NOW
 
@@ -184,3 +184,22 @@ def test_expiries_of_a_key_and_its_authority_are_announced(tmp_path: Path) -> No
     (mine,) = jane.ends(NOW + 24 * DAY).values()
     assert mine.startswith("the key of jane expires in 6 days")
     assert list(jane.ends(NOW + 27 * DAY)) == ["the key of jane", "the lab's authority"]
+
+
+def test_a_directory_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="can't be made"):
+        make_directory(tmp_path / "file" / "keys")
+
+
+def test_a_directory_that_is_open_to_others(tmp_path: Path) -> None:
+    (tmp_path / "keys").mkdir(mode=0o755)
+    with pytest.raises(UsageError, match="is open to others"):
+        make_directory(tmp_path / "keys")
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "roster").mkdir()
+    with pytest.raises(UsageError, match="can't be written"):
+        write(tmp_path / "roster", b"x")
+    assert [each.name for each in tmp_path.iterdir()] == ["roster"]

@@ -10,7 +10,7 @@ import pytest
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
-from skyloop.proxy.core.settings import FailsafeSettings
+from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.proxy import Proxy
 from skyloop.proxy.records import FlightRecord
 from skyloop.sim.host import SimHost

@@ -25,10 +25,9 @@ from skyloop.messages import (
 )
 from skyloop.network import FabricServer, FabricSettings, layout
 from skyloop.network import dial as fabric_dial
-from skyloop.network.access import access_control
 from skyloop.network.config import free_port
 from skyloop.network.keys import Lab
-from skyloop.network.keys.identity import make_identity
+from skyloop.network.keys.identity import access_control, make_identity
 from skyloop.transport.base import COMMANDS
 from skyloop.transport.testing import ClientLog, wait_until
 from tests.promises.security.rig import DRONE, Intruder, Rig, keys_of, make_lab, third_party

@@ -23,7 +23,7 @@ from skyloop.drivers.byte_stream import END_S
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, UnsupportedError, UsageError
-from skyloop.host.links import LinkThread
+from skyloop.host.threads import LinkThread
 from skyloop.messages import EmergencyStop, FlightState, Land, LinkState, Takeoff, Velocity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions

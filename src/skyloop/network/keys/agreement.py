@@ -67,13 +67,10 @@ class KeyRing:
             self._pending += self._read()
 
     def poll(self, now: datetime | None = None) -> list[str]:
-        """Read the roster if its file has changed, and return messages for users.
+        """Read the roster if its file has changed, and return messages for users, one sentence each.
 
         These announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported, and
         the previous one stays in force.
-
-        Returns:
-            The messages, one sentence each.
         """
         now = now or datetime.now(UTC)
         with self._lock:
@@ -152,28 +149,14 @@ class Agreement:
         return self._offered
 
     def answer(self, offer: bytes, now: datetime | None = None) -> tuple[bytes, Agreed]:
-        """Check the application's offer and create the proxy's answer.
-
-        Returns:
-            The answer, a :class:`Proof` as MessagePack, and the agreed secrets.
-
-        Raises:
-            LinkError: The other end did not prove an identity that the roster admits.
-        """
+        """Check the application's offer; return the proxy's answer, a :class:`Proof`, and the agreed secrets."""
         proof = _decode(offer)
         identity, expires = self._check(proof, self._claim(_OFFER, proof.share), now)
         claim = self._claim(_ANSWER, self._share, offer)
         return self._prove(claim), self._agree(identity, expires, proof.share, claim)
 
     def accept(self, answer: bytes, now: datetime | None = None) -> Agreed:
-        """Check the proxy's answer.
-
-        Returns:
-            The agreed secrets.
-
-        Raises:
-            LinkError: The other end did not prove an identity that the roster admits.
-        """
+        """Check the proxy's answer and return the agreed secrets."""
         proof = _decode(answer)
         claim = self._claim(_ANSWER, proof.share, self._offered)
         identity, expires = self._check(proof, claim, now)

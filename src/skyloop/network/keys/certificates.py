@@ -53,7 +53,6 @@ class Authority:
 
     @property
     def name(self) -> str:
-        """The authority's name, for users."""
         return common_name(self.certificate)
 
     @property
@@ -62,7 +61,7 @@ class Authority:
         return self.certificate.not_valid_after_utc
 
     def sign(self, content: bytes) -> bytes:
-        """Return a signature of content that is not a certificate; needs the key."""
+        """Return a signature of content that is not a certificate."""
         assert self.key is not None
         return self.key.sign(content, _SIGNED)
 
@@ -90,37 +89,18 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 def make_authority(days: int, now: datetime) -> Authority:
     """Create the authority of a new lab. Its name ends in random digits to distinguish labs."""
-    key = new_key()
-    name = _name(f"Skyloop lab {secrets.token_hex(4)}")
-    certificate = (
-        _builder(name, name, key, now, now + timedelta(days=days))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(authority=True), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    return Authority(certificate, key)
+    return _self_signed(f"Skyloop lab {secrets.token_hex(4)}", days, now)
 
 
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
     """Create a certificate for an identity, signed with the authority's key and valid no longer than the authority."""
-    assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
-    issuer = authority.certificate
-    end = min(until, issuer.not_valid_after_utc)
     urn = x509.UniformResourceIdentifier(f"{_URN}{identity.role}:{','.join(identity.drones)}")
-    return (
-        _builder(_name(identity.name), issuer.subject, key, now, end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(authority=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
-        .add_extension(x509.SubjectAlternativeName([urn]), critical=False)
-        .sign(authority.key, hashes.SHA256())
-    )
+    return _issued(authority, identity.name, key, until, now, purposes, [urn])
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
@@ -129,44 +109,17 @@ def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Autho
     Its certificates are valid for private addresses, names on local networks, and the given names. A browser that
     trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
     """
-    key = new_key()
-    name = _name(f"Skyloop pages {secrets.token_hex(4)}")
     permitted: list[x509.GeneralName] = [x509.IPAddress(ipaddress.ip_network(network)) for network in PAGE_NETWORKS]
     permitted += [x509.DNSName(each) for each in dict.fromkeys([*PAGE_NAMES, *names])]
-    certificate = (
-        _builder(name, name, key, now, now + timedelta(days=days))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(authority=True), critical=True)
-        .add_extension(x509.NameConstraints(permitted, None), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    return Authority(certificate, key)
+    return _self_signed(f"Skyloop pages {secrets.token_hex(4)}", days, now, x509.NameConstraints(permitted, None))
 
 
 def issue_page(
     authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Create a certificate for a cockpit's page.
-
-    Args:
-        authority: The authority for pages, with its key.
-        names: IP addresses and host names by which browsers reach the page, at least one.
-        key: The page's key.
-        until: Expiry in UTC, but no later than that of the authority's certificate.
-        now: The current time in UTC.
-    """
-    assert authority.key is not None
-    issuer = authority.certificate
-    end = min(until, issuer.not_valid_after_utc)
-    return (
-        _builder(_name("Skyloop cockpit"), issuer.subject, key, now, end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(authority=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
-        .add_extension(x509.SubjectAlternativeName([_general_name(each) for each in names]), critical=False)
-        .sign(authority.key, hashes.SHA256())
-    )
+    """Create a certificate for a cockpit's page, reached by these IP addresses and host names; see :func:`issue`."""
+    reached = [_general_name(each) for each in names]
+    return _issued(authority, "Skyloop cockpit", key, until, now, [ExtendedKeyUsageOID.SERVER_AUTH], reached)
 
 
 def page_names(certificate: x509.Certificate) -> list[str]:
@@ -187,11 +140,7 @@ def may_certify(authority: Authority, name: str) -> bool:
 
 
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
-    """Decode a certificate read from a file.
-
-    Raises:
-        FileFormatError: The data are not a certificate.
-    """
+    """Decode a certificate read from a file."""
     try:
         return x509.load_pem_x509_certificate(content)
     except ValueError:
@@ -199,11 +148,7 @@ def read_certificate(content: bytes, path: Path) -> x509.Certificate:
 
 
 def read_der(content: bytes) -> x509.Certificate:
-    """Decode a certificate received over the network.
-
-    Raises:
-        DecodeError: The data are not a certificate in DER.
-    """
+    """Decode a certificate in DER received over the network."""
     try:
         return x509.load_der_x509_certificate(content)
     except ValueError as error:
@@ -233,11 +178,7 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 
 
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Decode a private key read from a file.
-
-    Raises:
-        FileFormatError: The data are not a private key on an elliptic curve.
-    """
+    """Decode a private key on an elliptic curve, read from a file."""
     try:
         key = serialization.load_pem_private_key(content, password=None)
     except (ValueError, TypeError):  # TypeError is raised for an encrypted key
@@ -248,12 +189,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's. Its key is None where nothing is issued.
-
-    Raises:
-        FileFormatError: The certificate is not an authority's.
-        UsageError: The key does not belong to the certificate.
-    """
+    """Check that a certificate is an authority's. Its key is None where nothing is issued."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:
@@ -266,11 +202,6 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
-    """Return the identity in a certificate.
-
-    Raises:
-        FileFormatError: It does not name a role and drones.
-    """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         (urn,) = (uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_URN))
@@ -289,16 +220,10 @@ def common_name(certificate: x509.Certificate) -> str:
 
 
 def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
-    """Return whether a certificate belongs to this key."""
     return key.public_key() == certificate.public_key()
 
 
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
-    """Check that an authority issued a certificate.
-
-    Raises:
-        UsageError: Another authority issued it.
-    """
     try:
         certificate.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature):
@@ -308,11 +233,6 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
-    """Check that a certificate is currently valid.
-
-    Raises:
-        UsageError: The certificate is not valid yet, or has expired.
-    """
     if now >= certificate.not_valid_after_utc:
         raise UsageError(f"{what} expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: issue a new one")
     if now < certificate.not_valid_before_utc:
@@ -335,28 +255,39 @@ def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     return public
 
 
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: PrivateKey, now: datetime, end: datetime
-) -> x509.CertificateBuilder:
-    public = key.public_key()
+def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> Authority:
+    key, name = new_key(), _name(title)
+    builder = _builder(name, name, key, now, now + timedelta(days=days), authority=True)
+    for constraint in constraints:
+        builder = builder.add_extension(constraint, critical=True)
+    return Authority(builder.sign(key, hashes.SHA256()), key)
+
+
+def _issued(
+    authority: Authority,
+    title: str,
+    key: PrivateKey,
+    until: datetime,
+    now: datetime,
+    purposes: list[x509.ObjectIdentifier],
+    names: Sequence[x509.GeneralName],
+) -> x509.Certificate:
+    assert authority.key is not None
+    issuer = authority.certificate
     return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(public)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - BACKDATED)
-        .not_valid_after(end)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        _builder(_name(title), issuer.subject, key, now, min(until, issuer.not_valid_after_utc), authority=False)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .sign(authority.key, hashes.SHA256())
     )
 
 
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
-
-
-def _usage(*, authority: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: PrivateKey, now: datetime, end: datetime, *, authority: bool
+) -> x509.CertificateBuilder:
+    public = key.public_key()
+    usage = x509.KeyUsage(
         digital_signature=True,
         content_commitment=False,
         key_encipherment=False,
@@ -367,3 +298,19 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - BACKDATED)
+        .not_valid_after(end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
+        .add_extension(usage, critical=True)
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])

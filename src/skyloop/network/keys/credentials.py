@@ -16,6 +16,11 @@ from __future__ import annotations
 
 import base64
 import binascii
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -23,21 +28,10 @@ from typing import Final
 
 import msgspec
 
-from skyloop.errors import FileFormatError, UsageError
-from skyloop.files import expand
-from skyloop.network.keys import files
-from skyloop.network.keys.certificates import (
-    Authority,
-    Certificate,
-    PrivateKey,
-    check_issued,
-    check_time,
-    identity_of,
-    matches,
-    read_authority,
-    read_certificate,
-    read_key,
-)
+from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.files import expand, read_bytes
+from skyloop.network.keys import certificates
+from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
@@ -46,6 +40,8 @@ AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
+MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities has 3 MB
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
 
 
@@ -62,7 +58,6 @@ class Entry(msgspec.Struct, frozen=True):
 
     @property
     def identity(self) -> Identity:
-        """The identity described by the entry."""
         return Identity(self.name, self.role, self.drones)
 
     @property
@@ -90,10 +85,7 @@ class Roster(msgspec.Struct, frozen=True):
 
     @property
     def identities(self) -> list[Identity]:
-        """The identities that may join: all that have not been revoked.
-
-        Whether their certificates are valid is checked in the handshake.
-        """
+        """The identities that may join: all not revoked. The handshake checks whether their certificates are valid."""
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
@@ -116,12 +108,7 @@ def encode_roster(roster: Roster, authority: Authority) -> bytes:
 
 
 def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
-    """Check the signature of a roster file, then decode it.
-
-    Raises:
-        FileFormatError: The file is not a roster, is damaged, or has an unknown format.
-        UsageError: The file was modified, or another authority signed it.
-    """
+    """Check the signature of a roster file, then decode it."""
     try:
         file = msgspec.json.decode(content, type=_File)
         signature = base64.b64decode(file.signature, validate=True)
@@ -153,85 +140,62 @@ class Credentials:
 
     @property
     def name(self) -> str:
-        """The identity's name."""
         return self.identity.name
 
     @property
     def role(self) -> KeyRole:
-        """The identity's role."""
         return self.identity.role
 
     @property
     def authority_file(self) -> Path:
-        """Path of the lab authority's certificate."""
         return self.directory / AUTHORITY_FILE
 
     @property
     def certificate_file(self) -> Path:
-        """Path of the identity's certificate."""
         return self.directory / CERTIFICATE_FILE
 
     @property
     def key_file(self) -> Path:
-        """Path of the identity's private key."""
         return self.directory / KEY_FILE
 
     @property
     def roster_file(self) -> Path:
-        """Path of the roster."""
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return what has expired or will expire within a week: this key, the lab's authority, or both.
-
-        Returns:
-            A sentence for users about each, by subject.
-        """
+        """Return what expired or will within a week, this key or the lab's authority, and a sentence on it."""
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster if the folder has one, otherwise None.
-
-        Raises:
-            UsageError: The roster can't be read, or was not signed by this lab's authority.
-        """
+        """Return these credentials with a newer roster if the folder has one, otherwise None."""
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and verify all of it.
-
-    Raises:
-        UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` if a file is damaged or
-            of the wrong kind. The message says how to fix it.
-    """
+    """Read an identity's folder and verify all of it. Raises :class:`UsageError`, which says how to fix it."""
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
     _check_folder(path)
     certificate_path, key_path = path / CERTIFICATE_FILE, path / KEY_FILE
-    key = read_key(files.read_private(key_path, "the private key"), key_path)
-    certificate = read_certificate(files.read(certificate_path, "the certificate"), certificate_path)
+    key = certificates.read_key(read_private(key_path, "the private key"), key_path)
+    certificate = certificates.read_certificate(read(certificate_path, "the certificate"), certificate_path)
     authority = _read_authority(path)
-    if not matches(key, certificate):
+    if not certificates.matches(key, certificate):
         raise UsageError(f"{key_path} does not belong to the certificate {certificate_path}: copy both from one folder")
-    check_issued(certificate, authority, certificate_path)
-    check_time(authority.certificate, f"the lab's authority, {path / AUTHORITY_FILE},", now)
-    check_time(certificate, f"the key {path}", now)
-    identity = identity_of(certificate, certificate_path)
+    certificates.check_issued(certificate, authority, certificate_path)
+    certificates.check_time(authority.certificate, f"the lab's authority, {path / AUTHORITY_FILE},", now)
+    certificates.check_time(certificate, f"the key {path}", now)
+    identity = certificates.identity_of(certificate, certificate_path)
     roster = _read_roster(path, authority)
     _check_listed(identity, roster, path)
     return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path, certificate, key)
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the public certificate and the roster from the folder of a lab or an identity.
-
-    Raises:
-        UsageError: The folder does not exist, or a file in it is missing or invalid.
-    """
+    """Read the public certificate and the roster from the folder of a lab or an identity."""
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
     authority = _read_authority(directory)
@@ -253,12 +217,14 @@ def expiry_warning(what: str, end: datetime, now: datetime) -> str:
 
 def _read_authority(directory: Path) -> Authority:
     path = directory / AUTHORITY_FILE
-    return read_authority(read_certificate(files.read(path, "the authority's certificate"), path), None, path)
+    return certificates.read_authority(
+        certificates.read_certificate(read(path, "the authority's certificate"), path), None, path
+    )
 
 
 def _read_roster(directory: Path, authority: Authority) -> Roster:
     path = directory / ROSTER_FILE
-    return decode_roster(files.read(path, "the roster"), authority, path)
+    return decode_roster(read(path, "the roster"), authority, path)
 
 
 def _check_folder(path: Path) -> None:
@@ -282,3 +248,66 @@ def _check_listed(identity: Identity, roster: Roster, path: Path) -> None:
             f"the key {path} is of {identity}, but the roster says {entry.identity}: the key was replaced, "
             "use the new one"
         )
+
+
+# Files that hold keys: access rights and atomic replacement -----------------------------------------------------------
+
+
+def make_directory(path: Path) -> None:
+    """Create a directory that only its owner can enter, or check an existing one."""
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise UsageError(f"{path} can't be made: {error.strerror}") from None
+    if mode & _OTHERS:
+        raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
+
+
+def write(path: Path, content: bytes, *, private: bool = False) -> None:
+    """Replace a file atomically. A private one is readable only by its owner, from the first byte on."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UsageError(f"{path} can't be written: {error.strerror}") from None
+
+
+def read(path: Path, what: str) -> bytes:
+    """Read a file of at most :data:`MAX_BYTES`."""
+    return read_bytes(path, what, MAX_BYTES)
+
+
+def read_private(path: Path, what: str) -> bytes:
+    """Read a file that must not be accessible to others, because they might have copied the key."""
+    content = read(path, what)
+    mode = path.stat().st_mode
+    if mode & _OTHERS:
+        raise UsageError(
+            f"{what} {path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 600 it, and issue a new one if "
+            "others may have read it"
+        )
+    return content
+
+
+@contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Lock a directory against changes by other processes; wait for the lock, which ends with its process."""
+    try:
+        import fcntl
+    except ImportError:
+        raise UnsupportedError(
+            f"keys are made and revoked on Linux or macOS, but this is {sys.platform}; copy issued keys to this machine"
+        ) from None
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

@@ -32,7 +32,7 @@ from typing import Final
 import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.network.keys import certificates, files
+from skyloop.network.keys import certificates
 from skyloop.network.keys.certificates import Authority
 from skyloop.network.keys.credentials import (
     AUTHORITY_FILE,
@@ -43,6 +43,11 @@ from skyloop.network.keys.credentials import (
     Roster,
     decode_roster,
     encode_roster,
+    locked,
+    make_directory,
+    read,
+    read_private,
+    write,
 )
 from skyloop.network.keys.identity import Identity
 
@@ -69,75 +74,49 @@ class Lab:
 
     @classmethod
     def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
-        """Create a new authority in a folder of its own.
-
-        Args:
-            directory: The folder, created if it does not exist.
-            days: Validity of the authority, 1 to 36500.
-            now: The current time in UTC; by default this machine's clock.
-
-        Raises:
-            UsageError: The folder already contains an authority or can't be used, or ``days`` is out of range.
-        """
+        """Create a new authority in a new folder, valid for 1 to 36500 days."""
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
-        files.make_directory(directory)
-        with files.locked(directory):
+        make_directory(directory)
+        with locked(directory):
             if (directory / _AUTHORITY_KEY).exists():
                 raise UsageError(f"{directory} already has an authority: a new one would make all its keys worthless")
             authority = certificates.make_authority(days, _now(now))
             assert authority.key is not None
             lab = cls(directory, authority)
-            files.write(directory / AUTHORITY_FILE, certificates.certificate_pem(authority.certificate))
+            write(directory / AUTHORITY_FILE, certificates.certificate_pem(authority.certificate))
             lab._write_roster(Roster(1, authority.name))
-            files.write(directory / _AUTHORITY_KEY, certificates.key_pem(authority.key), private=True)
+            write(directory / _AUTHORITY_KEY, certificates.key_pem(authority.key), private=True)
         return lab
 
     @classmethod
     def open(cls, directory: Path) -> Lab:
-        """Open the authority in a folder.
-
-        Raises:
-            UsageError: The folder contains no authority, or a file is damaged.
-        """
+        """Open the authority in a folder."""
         key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
         if not key_path.exists():
             raise UsageError(f"there is no authority in {directory}: make one with skyloop keys init")
-        key = certificates.read_key(files.read_private(key_path, "the authority's key"), key_path)
-        content = files.read(certificate_path, "the authority's certificate")
+        key = certificates.read_key(read_private(key_path, "the authority's key"), key_path)
+        content = read(certificate_path, "the authority's certificate")
         certificate = certificates.read_certificate(content, certificate_path)
         return cls(directory, certificates.read_authority(certificate, key, certificate_path))
 
     @property
     def roster(self) -> Roster:
-        """The roster currently in the folder.
-
-        Raises :class:`UsageError` if it can't be read or was modified.
-        """
+        """The roster in the folder; :class:`UsageError` if it can't be read or was modified."""
         path = self.directory / ROSTER_FILE
-        return decode_roster(files.read(path, "the roster"), self.authority, path)
+        return decode_roster(read(path, "the roster"), self.authority, path)
 
     def folder(self, name: str) -> Path:
         """Return the path of an identity's folder."""
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create a new key and certificate for an identity, or renew them.
-
-        Args:
-            identity: The holder.
-            days: Validity of the key, more than 0 and at most :data:`MAX_IDENTITY_DAYS`; limited by the authority's.
-            now: The current time in UTC; by default this machine's clock.
-
-        Raises:
-            UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
-                still valid, or a file can't be written.
-        """
+        """Create or renew an identity's key and certificate; a revoked name only after its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
         certificates.check_time(self.authority.certificate, "the lab's authority", now)
-        with files.locked(self.directory):
+        with locked(self.directory):
             before = self.roster.find(identity.name)
             if before is not None and before.revoked and now < before.last_at:
                 raise UsageError(
@@ -146,25 +125,20 @@ class Lab:
                 )
             key = certificates.new_key()
             certificate = certificates.issue(self.authority, identity, key, now + timedelta(days=days), now)
-            entry = _entry(identity, certificate.serial_number, certificate.not_valid_after_utc, before)
+            expires, serial = int(certificate.not_valid_after_utc.timestamp()), f"{certificate.serial_number:x}"
+            last = max(expires, before.last) if before else expires
+            entry = Entry(identity.name, identity.role, identity.drones, serial, expires, last)
             folder = self.folder(identity.name)
-            files.make_directory(folder)
-            files.write(folder / KEY_FILE, certificates.key_pem(key), private=True)
-            files.write(folder / CERTIFICATE_FILE, certificates.certificate_pem(certificate))
-            files.write(folder / AUTHORITY_FILE, certificates.certificate_pem(self.authority.certificate))
+            make_directory(folder)
+            write(folder / KEY_FILE, certificates.key_pem(key), private=True)
+            write(folder / CERTIFICATE_FILE, certificates.certificate_pem(certificate))
+            write(folder / AUTHORITY_FILE, certificates.certificate_pem(self.authority.certificate))
             self._write_roster(self.roster.put(entry))
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Revoke an identity and delete the files in its folder here.
-
-        The revocation takes effect wherever the new roster is installed.
-
-        Raises:
-            UnknownNameError: The roster has no such name.
-            UsageError: It is already revoked.
-        """
-        with files.locked(self.directory):
+        """Revoke an identity, wherever the new roster is installed, and delete the files in its folder here."""
+        with locked(self.directory):
             roster = self.roster
             entry = roster.find(name)
             if entry is None:
@@ -178,22 +152,13 @@ class Lab:
         return revoked
 
     def _write_roster(self, roster: Roster) -> None:
-        """Write the roster to the lab's folder and to those of all identities.
-
-        Every folder copied from now on therefore has the newest one.
-        """
+        """Write the roster to the folders of the lab and all identities, so that every copy has the newest one."""
         content = encode_roster(roster, self.authority)
-        files.write(self.directory / ROSTER_FILE, content)
+        write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:
             folder = self.folder(entry.name)
             if not entry.revoked and folder.is_dir():
-                files.write(folder / ROSTER_FILE, content)
-
-
-def _entry(identity: Identity, serial: int, end: datetime, before: Entry | None) -> Entry:
-    expires = int(end.timestamp())
-    last = max(expires, before.last) if before else expires
-    return Entry(identity.name, identity.role, identity.drones, f"{serial:x}", expires, last)
+                write(folder / ROSTER_FILE, content)
 
 
 def _now(now: datetime | None) -> datetime:
@@ -215,21 +180,14 @@ def page_certificate(
 ) -> PageFiles:
     """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
 
-    Args:
-        directory: The folder, created if it does not exist.
-        own: This machine's addresses and names; those that the authority may not certify are left out.
-        wanted: Names given by the user.
-        now: The current time in UTC; by default this machine's clock.
-
-    Raises:
-        UsageError: A name in ``wanted`` may not be certified, no name remains, or a file can't be used.
-        MissingExtraError: The extra ``network`` is not installed.
+    ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
+    names given by the user, which it must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now
-    files.make_directory(directory.parent)
-    files.make_directory(directory)
+    make_directory(directory.parent)
+    make_directory(directory)
     made = PageFiles(directory / "page.pem", directory / "page.key", directory / "ca.pem")
-    with files.locked(directory):
+    with locked(directory):
         authority = _authority(directory, made.authority, [*own, *wanted], now)
         for name in wanted:
             if not certificates.may_certify(authority, name):
@@ -244,8 +202,8 @@ def page_certificate(
         if not _fits(made, authority, names, now):
             key = certificates.new_key()
             page = certificates.issue_page(authority, names, key, now + timedelta(days=PAGE_DAYS), now)
-            files.write(made.key, certificates.key_pem(key), private=True)
-            files.write(made.certificate, certificates.certificate_pem(page))
+            write(made.key, certificates.key_pem(key), private=True)
+            write(made.certificate, certificates.certificate_pem(page))
     left_out = tuple(name for name in own if not certificates.may_certify(authority, name))
     return PageFiles(made.certificate, made.key, made.authority, left_out)
 
@@ -253,23 +211,23 @@ def page_certificate(
 def _authority(directory: Path, path: Path, names: Sequence[str], now: datetime) -> Authority:
     key_path = directory / "ca.key"
     if key_path.exists():
-        key = certificates.read_key(files.read_private(key_path, "the key of the pages' authority"), key_path)
-        certificate = certificates.read_certificate(files.read(path, "the pages' authority"), path)
+        key = certificates.read_key(read_private(key_path, "the key of the pages' authority"), key_path)
+        certificate = certificates.read_certificate(read(path, "the pages' authority"), path)
         authority = certificates.read_authority(certificate, key, path)
         if authority.expires - now > timedelta(days=RENEWED_DAYS):
             return authority
     more = [name.lower() for name in names if not _is_address(name)]
     authority = certificates.make_page_authority(more, AUTHORITY_DAYS, now)
     assert authority.key is not None
-    files.write(path, certificates.certificate_pem(authority.certificate))
-    files.write(key_path, certificates.key_pem(authority.key), private=True)
+    write(path, certificates.certificate_pem(authority.certificate))
+    write(key_path, certificates.key_pem(authority.key), private=True)
     return authority
 
 
 def _fits(made: PageFiles, authority: Authority, names: Sequence[str], now: datetime) -> bool:
     if not (made.certificate.exists() and made.key.exists()):
         return False
-    page = certificates.read_certificate(files.read(made.certificate, "the page's certificate"), made.certificate)
+    page = certificates.read_certificate(read(made.certificate, "the page's certificate"), made.certificate)
     try:
         certificates.check_issued(page, authority, made.certificate)
     except UsageError:

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Position, Refusal, Takeoff, Velocity
 from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
 from skyloop.proxy.core.flight import STALE_NS
-from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, AirspaceSettings, Clamp, Limits
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
@@ -42,6 +42,77 @@ _AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same pos
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
 _NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
 _PASSES: Final = 8  # how often a velocity is reduced by all walls in turn before a stop is demanded
+
+#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches.
+#: Above the limit, it sinks at the same rate per metre.
+ALTITUDE_GAIN: Final = 1.0
+#: Altitudes above ``limits.altitude`` by up to this much count as altimeter noise [m].
+SLACK_M: Final = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Clamp:
+    """A limit that reduced a set-point. For tilt and speed, the two numbers are lengths of the vector."""
+
+    limit: str  #: name of the parameter
+    asked: float
+    applied: float
+    zone: str = ""  #: name of the no-fly zone, if any
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The effective limits."""
+
+    tilt: float = 0.35  #: maximum tilt from the vertical, by roll and pitch combined [rad]
+    climb: float = 1.0  #: maximum speed up or down [m/s]
+    yaw_rate: float = 1.75  #: maximum yaw rate [rad/s]
+    speed: float = 2.0  #: maximum horizontal speed [m/s]
+    altitude: float = 5.0  #: maximum height above ground [m]
+
+    def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        """Return the nearest set-point within the limits, and the limits that applied.
+
+        Tilt and horizontal speed are reduced without changing their direction. ``altitude`` is given [m] if known.
+        """
+        if type(action) is Velocity:
+            x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
+        else:
+            assert isinstance(action, Attitude)
+            x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
+        highest = self.climb
+        if altitude is not None:  # above the limit, room is negative and the vehicle descends
+            room = self.altitude - altitude
+            highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
+        if (
+            x * x + y * y <= longest * longest
+            and -self.climb <= up <= highest
+            and -self.yaw_rate <= yaw_rate <= self.yaw_rate
+        ):
+            return action, ()
+        clamps: list[Clamp] = []
+        length = math.hypot(x, y)
+        if length > longest:
+            clamps.append(Clamp("limits.speed" if type(action) is Velocity else "limits.tilt", length, longest))
+            x, y = x / length * longest, y / length * longest
+        allowed_up = max(-self.climb, min(highest, up))
+        if allowed_up != up:
+            near_the_top = up > highest and highest < self.climb
+            clamps.append(Clamp("limits.altitude" if near_the_top else "limits.climb", up, allowed_up))
+        allowed_yaw_rate = max(-self.yaw_rate, min(self.yaw_rate, yaw_rate))
+        if allowed_yaw_rate != yaw_rate:
+            clamps.append(Clamp("limits.yaw_rate", yaw_rate, allowed_yaw_rate))
+        return type(action)(x, y, allowed_up, allowed_yaw_rate), tuple(clamps)
+
+
+@dataclass(frozen=True, slots=True)
+class AirspaceSettings:
+    """Parameters for where the vehicle may fly, and how fast."""
+
+    limits: Limits = field(default_factory=Limits)
+    space: Space = field(default_factory=Space)
+    deceleration: float = 1.0  #: deceleration that the vehicle can reliably achieve [m/s²]
+    reaction_s: float = 0.3  #: delay before the vehicle begins to brake
 
 
 class Verdict(NamedTuple):
@@ -71,15 +142,11 @@ class Airspace:
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
     ) -> Verdict:
-        """Judge a new or repeated request.
+        """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
 
-        Args:
-            action: The requested action, with finite numbers.
-            feedback: The newest sample; None if there is none yet.
-            now_ns: The current time, on the clock of ``feedback.captured_ns`` [ns].
-            new: Whether it is a new request. A permitted target stays permitted while nothing else is requested: if
-                drift puts an obstacle in the way, the steps avoid it; a lower ceiling lowers the target.
-            planned: Whether it is part of a route that was checked as a whole, and so may be lowered from the start.
+        ``new``: a permitted target stays permitted while nothing else is requested: if drift puts an obstacle in the
+        way, the steps avoid it; a lower ceiling lowers the target. ``planned``: it is part of a route that was checked
+        as a whole, and so may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -181,10 +248,9 @@ class Airspace:
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point that stays inside the box and outside the zones.
+        """Return the nearest set-point between the walls, its limits, and whether the position is known.
 
-        Returns:
-            The set-point (unchanged if the position is unknown), the limits that applied, and whether it is known.
+        If it is not, the set-point is unchanged.
         """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
@@ -309,9 +375,8 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        if (
-            not goes_on and action.speed is not None and action.speed > speed
-        ):  # only once, because the direction changes near the target
+        # Only once, because the direction changes near the target.
+        if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
             clamps.append(Clamp("limits.yaw_rate", action.turn_rate, limits.yaw_rate))

@@ -125,9 +125,8 @@ class Authority:
         self.last_command_ns = 0  #: time of the last valid command from this or an earlier holder
         self._granted_ns = 0  # when the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
-        self.silent: QueueEntry | None = (
-            None  #: the last holder if it lost the lease by silence; listed until there is a request for the authority
-        )
+        #: The last holder if it lost the lease by silence; listed until there is a request for the authority.
+        self.silent: QueueEntry | None = None
         self._last_lease = 0
         self._arrivals = 0
         self._waiting: list[QueueEntry] = []
@@ -175,14 +174,7 @@ class Authority:
     # Requests of applications ------------------------------------------------------------------------------------
 
     def request(
-        self,
-        app_id: int,
-        priority: int,
-        queue: bool,
-        now_ns: int,
-        *,
-        term_ns: int | None = None,
-        ask: bool = False,
+        self, app_id: int, priority: int, queue: bool, now_ns: int, *, term_ns: int | None = None, ask: bool = False
     ) -> list[Effect]:
         """Request the authority, or change the priority or the time of an earlier request.
 

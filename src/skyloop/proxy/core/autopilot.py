@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final, NamedTuple
 
@@ -32,9 +33,8 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.geometry import clamped, wrap_angle
-from skyloop.proxy.core.airspace import Airspace
+from skyloop.proxy.core.airspace import Airspace, Clamp
 from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
-from skyloop.proxy.core.settings import AutopilotSettings, Clamp, ReturnSettings
 from skyloop.zones import Space, Vec3
 
 PERIOD_S: Final = 0.02  #: period of the steps that it is designed for
@@ -70,6 +70,27 @@ def software_actions(native: frozenset[str]) -> frozenset[str]:
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotSettings:
+    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
+
+    takeoff_altitude: float = 1.0
+    climb: float = 0.5
+    descent: float = 0.4
+    velocity_p: float = 0.15
+    velocity_i: float = 0.05
+    tilt: float = 0.35
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnSettings:
+    """Settings of a return."""
+
+    height: float = 2.0  #: minimum height above the start on the way [m]
+    speed: float = 1.0  #: maximum speed on the way [m/s]
+    land: bool = True  #: whether to land at the end rather than hover
 
 
 class Mode(Enum):

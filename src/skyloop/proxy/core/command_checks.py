@@ -40,12 +40,11 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.command import ENDINGS, MAX_OUTCOME_TEXT, SET_POINTS
-from skyloop.proxy.core.airspace import Airspace, Verdict
+from skyloop.proxy.core.airspace import Airspace, Clamp, Verdict
 from skyloop.proxy.core.authority import Authority
-from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, StartPoint
+from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
-from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn

@@ -11,7 +11,6 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
-from skyloop.proxy.core.settings import FailsafeSettings
 
 #: The charge must rise this far above a level before falling below it counts again.
 BATTERY_REARM: Final = 0.05
@@ -42,6 +41,19 @@ _CONTRADICTIONS: Final = {
 
 
 FailsafeTask = Hover | Land | ReturnToStart
+
+
+@dataclass(frozen=True, slots=True)
+class FailsafeSettings:
+    """The failsafe's thresholds: times in s, battery levels as charge from 0 to 1."""
+
+    hover_after_s: float = 0.5
+    land_after_s: float = 5.0
+    retry_s: float = 0.25
+    battery_warn: float = 0.2
+    battery_land: float = 0.1  #: charge at which to land; 0: never
+    battery_return: float = 0.0  #: charge at which to return; 0: never
+    returns: bool = False  #: whether a vehicle without a pilot lands at its start
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,15 +72,11 @@ class Snapshot(NamedTuple):
 
 
 class Flight:
-    """The known state of one vehicle's flight.
+    """The known state of one vehicle's flight, which others may also fly if it is ``shared``.
 
     :meth:`state` and :meth:`flies` acquire no lock and change nothing, so any thread may call them. Everything else is
-    called under the command handler's lock.
-
-    Args:
-        native: The actions that the vehicle itself supports. A vehicle steered in software that has no take-off and
-            landing of its own has no concept of a flight; its flight state follows from commands and observations.
-        shared: Whether others may also fly the vehicle; if not, flights never belong to others.
+    called under the command handler's lock. A vehicle steered in software that has no ``native`` take-off and landing
+    has no concept of a flight; its flight state follows from commands and observations.
     """
 
     def __init__(self, native: frozenset[str] = frozenset(), *, shared: bool = True) -> None:

@@ -23,18 +23,10 @@ __all__ = ["LocalServer", "dial", "list_names", "names_of_others"]
 
 
 def dial(name: str, *, group: str | None = None) -> Dialer:
-    """Return a dialer for a proxy on this host.
+    """Return a dialer for a proxy on this host. ``group``: users who share its directory (default: ``SKYLOOP_GROUP``).
 
     The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if it does not accept
     the connection (it was killed, is stopped, or belongs to another user). It returns or raises within about a second.
-
-    Args:
-        name: The proxy's name.
-        group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
-
-    Raises:
-        UsageError: The name or the group is invalid.
-        UnsupportedError: This is not Linux.
     """
     _check_platform()
     from skyloop.transport.local.client import LocalClient
@@ -61,19 +53,10 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """List the running proxies on this host that this user can reach.
+    """List by name the running proxies on this host that this user can reach; none on systems other than Linux.
 
-    Removes sockets left by killed proxies.
-
-    Args:
-        group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
-
-    Returns:
-        The proxies, sorted by name; none on systems other than Linux.
-
-    Raises:
-        LinkError: The directory of sockets is not safe.
-        UsageError: The group is invalid.
+    Removes sockets left by killed proxies. ``group``: as for :func:`dial`. Raises :class:`LinkError` if the directory
+    of sockets is not safe.
     """
     if sys.platform != "linux":
         return []

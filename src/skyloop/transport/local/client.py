@@ -34,13 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 class LocalClient(TransportClient):
-    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns.
-
-    Args:
-        sock: A socket connected to the proxy.
-        name: The proxy's name.
-        handler: Called on the receiving thread, which starts at once.
-    """
+    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns; receives at once."""
 
     # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
     # for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing it to another thread takes
@@ -245,13 +239,7 @@ class LocalClient(TransportClient):
         return self._reason or "closed by the application"
 
     def _control(self, packet: bytes, descriptors: list[int]) -> None:
-        """Handle one of the transport's own packets other than a frame, and close its descriptors.
-
-        Raises:
-            DecodeError: The packet can't be parsed.
-            LinkError: The proxy announced something invalid.
-            OSError: A slot can't be mapped.
-        """
+        """Handle one of the transport's own packets other than a frame, and close its descriptors."""
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
@@ -296,19 +284,7 @@ class SlotView:
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
     def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
-        """Map the memory.
-
-        Args:
-            number: The slot's number on the wire.
-            camera: The camera's number.
-            capacity: The slot's size [bytes].
-            fd: The slot's descriptor, which still belongs to the caller.
-            held: The numbers of all of this camera's slots that the application holds; shared by the camera's slots.
-
-        Raises:
-            LinkError: The memory could shrink while it is read, or is smaller than announced.
-            OSError: The memory can't be mapped.
-        """
+        """Map the memory, unless it could shrink while it is read; ``fd`` still belongs to the caller."""
         self.number = number
         self.camera = camera
         self.capacity = capacity
@@ -351,13 +327,7 @@ class Lease:
 
 
 class Leases:
-    """A client's slots.
-
-    The garbage collector may call :meth:`released` on any thread at any point.
-
-    Args:
-        send_release: Returns a slot to the server by its number; must not acquire a lock.
-    """
+    """A client's slots. The garbage collector may call :meth:`released` on any thread at any point."""
 
     #: Number of a camera's frames that an application may hold in place. Further ones are copied, so that an
     #: application that collects frames does not exhaust the server's limit and starve itself.
@@ -369,18 +339,7 @@ class Leases:
         self._held: dict[int, set[int]] = {}
 
     def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot announced by the server.
-
-        Args:
-            number: The slot's number.
-            camera: The camera's number.
-            capacity: The slot's size [bytes].
-            fd: The slot's descriptor, which still belongs to the caller.
-
-        Raises:
-            LinkError: The memory is unusable.
-            OSError: It can't be mapped.
-        """
+        """Map a slot announced by the server; ``fd`` still belongs to the caller."""
         self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
 
     def retire(self, camera: int, before: int) -> None:
@@ -396,21 +355,10 @@ class Leases:
         from here to the client, its handler and the frames that it keeps would keep all of them alive forever.
         """
         self._slots.clear()
-        self._send_release = _discard_release
+        self._send_release = lambda _: None
 
     def pixels(self, number: int, size: int) -> Pixels:
-        """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames.
-
-        Args:
-            number: The slot's number.
-            size: The frame's size [bytes].
-
-        Returns:
-            Shape (size,), dtype uint8, not writeable.
-
-        Raises:
-            LinkError: The server has not announced such a slot.
-        """
+        """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames."""
         slot = self._slots.get(number)
         if slot is None or not 0 <= size <= slot.capacity:
             raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")
@@ -426,7 +374,3 @@ class Leases:
         """Return a slot to the server, now that the application's last array over it is gone."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)
-
-
-def _discard_release(_: int) -> None:
-    """Drop a release, because the connection has ended."""

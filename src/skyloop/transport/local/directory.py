@@ -51,13 +51,7 @@ class Proxy(NamedTuple):
 
 
 class Directory:
-    """A user's view of the directory of sockets; see :func:`find_directory`.
-
-    Args:
-        path: The absolute path.
-        gid: The group that shares it; None for this user alone.
-        kind: Kind of the sockets, :data:`PROXY` or :data:`HOST`. Each kind has its own names.
-    """
+    """A user's view of the directory of sockets; see :func:`find_directory`. Each kind of socket has its own names."""
 
     def __init__(self, path: Path, gid: int | None, kind: str = PROXY) -> None:
         self.path = path
@@ -66,11 +60,7 @@ class Directory:
         self._suffix = _SUFFIXES[kind]
 
     def socket_path(self, name: str) -> Path:
-        """Return the path of a proxy's socket.
-
-        Raises:
-            UsageError: The name is invalid, or the path is longer than :data:`MAX_PATH`.
-        """
+        """Return the path of a proxy's socket, which must not be longer than :data:`MAX_PATH`."""
         check_name(name)
         path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
@@ -81,12 +71,7 @@ class Directory:
         return path
 
     def create(self) -> None:
-        """Create the directory if it is missing, give it to the group if there is one, and check it.
-
-        Raises:
-            LinkError: The directory is not safe; see :meth:`check`.
-            OSError: The directory can't be created.
-        """
+        """Create the directory if it is missing, give it to the group if there is one, and check it."""
         self.path.parent.mkdir(mode=0o700 if self.gid is None else 0o755, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             self.path.mkdir(mode=0o700)
@@ -96,12 +81,7 @@ class Directory:
         self.check()
 
     def check(self) -> None:
-        """Check that no other user can put a socket here.
-
-        Raises:
-            LinkError: Another user owns the directory, or can change it or its parent.
-            FileNotFoundError: There is no such directory.
-        """
+        """Check that no other user can put a socket here; ``FileNotFoundError`` if there is no such directory."""
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
         if not stat.S_ISDIR(here.st_mode):
             raise LinkError(f"{self.path} is not a directory: remove it, or set {DIRECTORY_VARIABLE} to another one")
@@ -124,11 +104,7 @@ class Directory:
             )
 
     def proxies(self) -> list[Proxy]:
-        """List the running proxies by name, and remove sockets left by killed ones.
-
-        Raises:
-            LinkError: The directory is not safe.
-        """
+        """List the running proxies by name, and remove sockets left by killed ones."""
         try:
             self.check()
         except FileNotFoundError:
@@ -153,19 +129,7 @@ class Directory:
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
-        """Listen under a name, replacing a killed proxy with that name.
-
-        Args:
-            name: The proxy's name.
-
-        Returns:
-            The listening socket, and the inode of its file for :meth:`remove`.
-
-        Raises:
-            NameTakenError: A running proxy uses the name.
-            LinkError: The directory is not safe, or stayed locked for :data:`LOCK_TIMEOUT_S`.
-            UsageError: The name or its path is invalid.
-        """
+        """Listen under a name, replacing a killed proxy; return the socket, and its file's inode for :meth:`remove`."""
         path = self.socket_path(name)
         self.create()
         with self.lock():
@@ -193,14 +157,7 @@ class Directory:
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
-        """Lock the directory against changes by other processes.
-
-        Args:
-            timeout_s: How long to wait for the lock [s].
-
-        Raises:
-            LinkError: Another process holds the lock for longer than that.
-        """
+        """Lock the directory against changes by other processes; :class:`LinkError` if one holds it for longer."""
         here, path = self._lstat(self.path), self.path
         flags = os.O_RDONLY | os.O_DIRECTORY
         if here.st_mode & stat.S_IRWXG:
@@ -223,15 +180,7 @@ class Directory:
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return this user's directory, or the one shared by a group, without touching any file.
-
-    Args:
-        group: The name of the group (default: the variable ``SKYLOOP_GROUP``).
-        kind: Kind of the sockets in it.
-
-    Raises:
-        UsageError: The group does not exist, or no directory is configured that its members can reach.
-    """
+    """Return this user's directory, or the one shared by a group (``SKYLOOP_GROUP``), without touching any file."""
     group = group or os.environ.get(GROUP_VARIABLE) or None
     configured = os.environ.get(DIRECTORY_VARIABLE)
     if group is not None and not configured:
@@ -269,9 +218,8 @@ def is_live(path: Path) -> bool:
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
     """Return the names of other users' proxies on this host, by user; we can't open their sockets.
 
-    Args:
-        table: Content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
-        owner: Returns the user id of a directory's owner; None if unknown.
+    ``table``: the content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
+    ``owner``: returns the user id of a directory's owner; None if unknown.
     """
     found: dict[str, list[str]] = {}
     for line in table.splitlines():
@@ -305,11 +253,7 @@ def owner_pid(path: Path) -> int | None:
 
 
 def connect(path: Path) -> Socket:
-    """Connect to the socket at this path.
-
-    Raises:
-        OSError: There is no socket, or no process accepts within :data:`CONNECT_TIMEOUT_S`.
-    """
+    """Connect to the socket at this path; ``OSError`` if no process accepts within :data:`CONNECT_TIMEOUT_S`."""
     sock = Socket()
     # Without a time-out, connecting to a stopped process whose queue is full would block forever.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)

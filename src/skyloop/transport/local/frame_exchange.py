@@ -15,6 +15,7 @@ import mmap
 import os
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
@@ -37,16 +38,7 @@ class SlotMemory:
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
-        """Reserve the memory.
-
-        Args:
-            number: The slot's number on the wire.
-            generation: The generation of its camera's slots.
-            capacity: Size [bytes].
-
-        Raises:
-            OSError: Out of memory or descriptors.
-        """
+        """Reserve the memory [bytes]. Raises ``OSError`` if there is too little, or no descriptor is left."""
         self.fd = -1
         self.number = number
         self.generation = generation
@@ -64,12 +56,7 @@ class SlotMemory:
 
 
 def check_support() -> None:
-    """Check that the kernel supports the transport.
-
-    Raises:
-        UnsupportedError: The kernel has no sealed shared memory.
-        LinkError: Out of memory or descriptors.
-    """
+    """Check that the kernel supports the transport."""
     try:
         SlotMemory(0, 0, mmap.PAGESIZE)
     except OSError as error:
@@ -91,30 +78,19 @@ class Connection(Protocol):
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None: ...
 
 
+@dataclass(slots=True, eq=False)
 class Viewer:
     """One client's subscription to one camera."""
 
-    __slots__ = ("active", "announced", "connection", "leases", "retire_before", "waits")
-
-    def __init__(self, connection: Connection) -> None:
-        self.connection = connection
-        self.leases: dict[int, SlotMemory] = {}
-        self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number are retired, and the client must be notified; 0: none
-        self.active = True  #: whether it gets frames; if not, it may still hold some
-        self.waits = False  #: whether it was skipped, and waits for a frame
+    connection: Connection
+    leases: dict[int, SlotMemory] = field(default_factory=dict)
+    announced: set[int] = field(default_factory=set)
+    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
+    active: bool = True  #: whether it gets frames; if not, it may still hold some
+    waits: bool = False  #: whether it was skipped, and waits for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
-        """Send a frame, unless the viewer holds enough frames or its socket is full.
-
-        Args:
-            slot: The frame's slot.
-            packet: The packet that announces it.
-            camera: The camera's number.
-
-        Returns:
-            Whether the frame was sent; if not, the viewer is marked as waiting.
-        """
+        """Send a frame, unless the viewer holds enough frames or its socket is full; then mark it as waiting."""
         self.waits = True
         if len(self.leases) >= MAX_LEASES:
             return False
@@ -136,12 +112,7 @@ class Viewer:
 
 
 class Camera:
-    """The slots and viewers of one camera. Not thread-safe: :class:`FrameExchange` holds a lock.
-
-    Args:
-        number: The camera's number on the wire.
-        slot_numbers: Yields numbers for new slots, unique over all cameras.
-    """
+    """The slots and viewers of one camera. Not thread-safe: :class:`FrameExchange` holds a lock."""
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
@@ -157,11 +128,7 @@ class Camera:
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
-        """Return a slot to write a frame to; the writer holds it until :meth:`offer`.
-
-        Raises:
-            OSError: Out of memory or descriptors.
-        """
+        """Return a slot to write a frame to; the writer holds it until :meth:`offer`. ``OSError``: out of memory."""
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
             # The size of compressed frames varies, so when one outgrows its slots, new slots get some spare room.
@@ -179,15 +146,7 @@ class Camera:
         return slot
 
     def offer(self, slot: SlotMemory, packet: bytes) -> int:
-        """Send a written slot to all viewers.
-
-        Args:
-            slot: A slot from :meth:`take`.
-            packet: The packet that announces the frame.
-
-        Returns:
-            The number of skipped viewers.
-        """
+        """Send a slot from :meth:`take` to all viewers; return the number of those skipped."""
         missed = 0
         for viewer in self.active:
             if not viewer.hand(slot, packet, self.number):
@@ -205,11 +164,7 @@ class Camera:
             self._free.append(slot)
 
     def released(self, viewer: Viewer, number: int) -> bool:
-        """Take a slot back from a viewer, and send it the newest frame if it is waiting for one.
-
-        Returns:
-            False if the viewer did not hold the slot.
-        """
+        """Take a slot back from a viewer, if it holds it, and send it the newest frame if it is waiting for one."""
         slot = viewer.leases.pop(number, None)
         if slot is None:
             return False
@@ -235,8 +190,7 @@ class Camera:
 
     def leave(self, connection: Connection) -> None:
         """Remove a client that is gone, and free all its slots."""
-        viewer = self.viewers.pop(connection, None)
-        if viewer is not None:
+        if (viewer := self.viewers.pop(connection, None)) is not None:
             for slot in viewer.leases.values():
                 self.drop(slot)
             self._trim()
@@ -279,15 +233,7 @@ class FrameExchange:
         self._camera_numbers = itertools.count(1)
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Copy a frame once and send it to the camera's viewers.
-
-        Args:
-            header: The frame's header.
-            pixels: ``header.size`` bytes, dtype uint8, any shape.
-
-        Returns:
-            The number of viewers that did not get the frame, which is all of them if memory ran out.
-        """
+        """Copy a frame once and send it to the camera's viewers; return how many missed it: all if memory ran out."""
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
             return 0
@@ -313,9 +259,7 @@ class FrameExchange:
     def unsubscribe(self, connection: Connection, name: str) -> None:
         """Stop sending a camera's frames to a connection."""
         with self._lock:
-            camera = self._cameras.get(name)
-            viewer = camera.viewers.get(connection) if camera is not None else None
-            if camera is not None and viewer is not None:
+            if (camera := self._cameras.get(name)) and (viewer := camera.viewers.get(connection)):
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:

@@ -104,32 +104,23 @@ def hello() -> bytes:
 
 
 def subscribe(topic: str, on: bool) -> bytes:
-    """Encode a :class:`Subscribe`."""
     return _packet(LocalKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def release(slot: int) -> bytes:
-    """Encode a :class:`Release`."""
     return _packet(LocalKind.RELEASE, _NUMBER.pack(slot))
 
 
 def slot(number: int, camera: int, capacity: int) -> bytes:
-    """Encode a :class:`Slot`."""
     return _packet(LocalKind.SLOT, _SLOT.pack(number, camera, capacity))
 
 
 def frame(number: int, header: bytes) -> bytes:
-    """Encode a :class:`Frame`.
-
-    Args:
-        number: The slot's number.
-        header: The whole packet of the :class:`FrameHeader`.
-    """
+    """Encode a :class:`Frame`; ``header``: the whole packet of its :class:`FrameHeader`."""
     return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
 
 
 def retire(camera: int, before: int) -> bytes:
-    """Encode a :class:`Retire`."""
     return _packet(LocalKind.RETIRE, _RETIRE.pack(camera, before))
 
 
@@ -143,11 +134,7 @@ def _packet(kind: LocalKind, body: bytes) -> bytes:
 
 
 def parse(packet: bytes) -> Message:
-    """Decode one of the transport's own packets.
-
-    Raises:
-        DecodeError: The packet is of another kind, or damaged.
-    """
+    """Decode one of the transport's own packets."""
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")
     if packet[5:6] == FRAME:
@@ -158,7 +145,10 @@ def parse(packet: bytes) -> Message:
     body = packet[HEADER_SIZE:]
     try:
         if kind == LocalKind.SUBSCRIBE:
-            return _parse_subscribe(body)
+            on, topic = body[0], body[1:].decode()
+            if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
+                raise DecodeError(f"invalid subscription: {len(topic)} characters, flag {on}")
+            return Subscribe(topic, bool(on))
         if kind == LocalKind.BYE:
             return Bye(body[:MAX_REASON].decode(errors="replace"))
         layout, message = _FIXED[kind]
@@ -176,11 +166,7 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello | Release | Slot | Retir
 
 
 def parse_frame(packet: bytes) -> Frame:
-    """Decode a frame's packet, header and slot in one step, because such packets are frequent.
-
-    Raises:
-        DecodeError: The packet is of another kind, or damaged.
-    """
+    """Decode a frame's packet, header and slot in one step, because such packets are frequent."""
     if len(packet) < _FRAME_PREFIX.size:
         raise DecodeError(f"{len(packet)} bytes are too few for the {_FRAME_PREFIX.size} before the header of a frame")
     signature, version, _, reserved, length, slot = _FRAME_PREFIX.unpack_from(packet)
@@ -190,13 +176,6 @@ def parse_frame(packet: bytes) -> Frame:
     if type(header) is not FrameHeader:
         raise DecodeError(f"a frame was announced by a {type(header).__name__} and must be announced by a FrameHeader")
     return Frame(slot, header)
-
-
-def _parse_subscribe(body: bytes) -> Subscribe:
-    on, topic = body[0], body[1:].decode()
-    if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
-        raise DecodeError(f"invalid subscription: {len(topic)} characters, flag {on}")
-    return Subscribe(topic, bool(on))
 
 
 WAKE: Final = _packet(LocalKind.WAKE, b"")

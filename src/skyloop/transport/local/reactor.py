@@ -45,15 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 class Source:
-    """A socket that a reactor waits for: a server's listener, or one of its connections.
-
-    Args:
-        server: The socket's server.
-        sock: The listener; None for a connection.
-        connection: The connection; None for a listener.
-    """
-
-    __slots__ = ("connection", "ended", "fileno", "lane", "muted", "server", "since_s", "sock")
+    """A socket that a reactor waits for: a server's listener (``sock``), or one of its connections."""
 
     def __init__(
         self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
@@ -122,12 +114,9 @@ class Reactor:
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to one server, and return a new one that receives for all others. Thread-safe.
+        """Leave this reactor to the server whose handler blocks it; return a new one for all others. Thread-safe.
 
         No packet is lost or delivered twice, and the packets of each connection keep their order.
-
-        Args:
-            stuck: The server whose handler blocks the thread.
         """
         with self._lock:
             moved = [source for source in self._sources.values() if source.server is not stuck]
@@ -194,11 +183,7 @@ class Reactor:
         self._epoll.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
-        """Read a packet from each socket, to find out which are urgent or superseded.
-
-        Returns:
-            Whether more may be waiting behind one of them.
-        """
+        """Read a packet from each socket, to see which are urgent or superseded; return whether more may be waiting."""
         sources, more = self._sources, False
         for fileno, _ in ready:
             source = sources.get(fileno)
@@ -257,14 +242,6 @@ class SharedLocalServer(LocalServer):
     """A :class:`LocalServer` that shares its receiving thread with others.
 
     Its handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
-
-    Args:
-        name: The proxy's name.
-        reactor: The reactor that receives for it until a split.
-        group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
-
-    Raises:
-        UsageError: The name or the group is invalid, or the socket's path would be too long.
     """
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
@@ -308,15 +285,10 @@ class SharedLocalServer(LocalServer):
     # --- the reactor's thread ---
 
     def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
-        """Accept a connection, or read a packet of one.
+        """Accept a connection, or read a packet of one; return whether more may be waiting behind it.
 
-        Args:
-            reactor: The reactor of this thread.
-            source: The readable source.
-            at_once: Whether nothing else is waiting for this thread, so that a command is handled right here.
-
-        Returns:
-            Whether the packet must be handled by :meth:`deliver`, possibly with more behind it.
+        ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
+        :meth:`deliver`.
         """
         with self._lock:  # held from receiving to handling, so that after a split nothing overtakes this packet
             if not self._is_current(reactor, source):
@@ -345,16 +317,7 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first waiting packet of a source.
-
-        Args:
-            reactor: The reactor of this thread.
-            source: The source, from this lane.
-            lane: The lane.
-
-        Returns:
-            The lane in which to queue the source again; None for no lane.
-        """
+        """Handle the first waiting packet of a source from this lane; return the lane in which to queue it again."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
                 return None  # it has become more urgent and moved to that lane

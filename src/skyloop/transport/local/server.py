@@ -50,14 +50,8 @@ class LocalServer(TransportServer):
     """A proxy's end, which is found on this host by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
-    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature.
-
-    Args:
-        name: The proxy's name.
-        group: A group of users whose members may also connect (default: the variable ``SKYLOOP_GROUP``).
-
-    Raises:
-        UsageError: The name or the group is invalid, or the socket's path would be too long.
+    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature. ``group``: users who
+    may also connect (``SKYLOOP_GROUP``).
     """
 
     def __init__(self, name: str, *, group: str | None = None) -> None:
@@ -113,7 +107,8 @@ class LocalServer(TransportServer):
             thread.join()  # a handler that stops its own server must not wait for itself
 
     def send(self, peer: Peer, packet: bytes) -> bool:
-        check_packet(packet)
+        if not 0 < len(packet) <= MAX_PACKET:
+            check_packet(packet)
         connection = self._peers.get(peer.id)
         if connection is None:
             return False
@@ -153,8 +148,7 @@ class LocalServer(TransportServer):
             return ""
 
     def disconnect(self, peer: Peer, reason: str) -> None:
-        connection = self._peers.get(peer.id)
-        if connection is not None:
+        if (connection := self._peers.get(peer.id)) is not None:
             connection.hang_up(reason)
 
     @property
@@ -213,8 +207,7 @@ class LocalServer(TransportServer):
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
             return None
-        problem = self._make_room(who)
-        if problem:
+        if problem := self._make_room(who):
             sock.hang_up(packets.bye(problem))
             return None
         self._last_id += 1
@@ -274,13 +267,14 @@ class LocalServer(TransportServer):
                 continue  # handled at once, because a command behind it must not have to wait for it
             lock.acquire(is_command(packet))
             try:
-                if connection.pilot and poll(0):  # it had to wait, so packets that have arrived since may supersede it
+                more = connection.pilot and poll(0)
+                if more:  # it had to wait, so packets that have arrived since may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
             finally:
                 lock.release()
-            while backlog and not reason:
+            while more and backlog and not reason:
                 lock.acquire(backlog.lane is not Lane.OTHERS)
                 try:
                     reason = self._take(handler, connection, self._next(connection))
@@ -318,11 +312,7 @@ class LocalServer(TransportServer):
         handler.peer_joined(connection.peer)
 
     def _control(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> bool:
-        """Handle one of the transport's own packets.
-
-        Returns:
-            False if it makes no sense; the handler gets it, like any other garbage.
-        """
+        """Handle one of the transport's own packets; return False for garbage, which the handler gets."""
         try:
             message = packets.parse(packet)
         except DecodeError:
@@ -379,12 +369,7 @@ class LocalServer(TransportServer):
 
 
 def _problem(topic: str, subscribed: int) -> str:
-    """Return why an application can't subscribe to an existing topic; empty if it can.
-
-    Args:
-        topic: The topic.
-        subscribed: Number of topics that the application has subscribed to.
-    """
+    """Return why an application with that many topics can't subscribe to another existing one; empty if it can."""
     if topic.startswith(_VIDEO) and "?" in topic:
         return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"
     return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""

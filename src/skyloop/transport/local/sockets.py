@@ -9,6 +9,7 @@ import pwd
 import select
 import socket
 import struct
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from skyloop.transport.base import MAX_PACKET, Peer
@@ -30,9 +31,6 @@ class Socket(socket.socket):
 
     Both ends *shut down* a connection and drop their references, but never close it, so that a descriptor's number
     can't be reused while a thread is sending on it.
-
-    Args:
-        fileno: An open descriptor to take over; None for a new socket.
     """
 
     def __init__(self, fileno: int | None = None) -> None:
@@ -48,18 +46,11 @@ class Socket(socket.socket):
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         """End the connection in both directions, after a last packet if it fits."""
-        try:
-            if last_packet:
+        if last_packet:
+            with suppress(OSError):
                 self.send(last_packet, SEND_FLAGS)
+        with suppress(OSError):  # it had already ended
             self.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            self._shut_down_quietly()
-
-    def _shut_down_quietly(self) -> None:
-        try:
-            self.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            return  # it had already ended
 
 
 class Credentials(NamedTuple):
@@ -89,15 +80,7 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the connecting process has access.
-
-    Args:
-        sock: The accepted connection.
-        gid: The group that has access; None if there is none.
-
-    Returns:
-        True for a process of this process's user, of the superuser, or of a member of the group.
-    """
+    """Return whether the connecting process has access: as our own user, the superuser, or a member of the group."""
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
@@ -112,41 +95,13 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long the kernel blocks in a call, which then fails with ``EAGAIN``.
-
-    Args:
-        sock: The socket.
-        option: ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``.
-        seconds: The limit [s]; 0 for none.
-    """
+    """Limit how long calls block [s], by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; after that, ``EAGAIN``; 0: no limit."""
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
 
 class ServerConnection:
-    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread.
-
-    Args:
-        sock: The accepted socket.
-        peer: The peer, as the handler knows it.
-        who: The process at the other end, as the kernel reports it.
-    """
-
-    __slots__ = (
-        "_send",
-        "_socket",
-        "admitted",
-        "backlog",
-        "ending",
-        "joined",
-        "peer",
-        "pilot",
-        "poll",
-        "reason",
-        "receive",
-        "topics",
-        "who",
-    )
+    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread."""
 
     def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
@@ -193,35 +148,20 @@ class ServerConnection:
         return superseded
 
     def limit_silence(self, seconds: float) -> None:
-        """Set how long :attr:`receive` waits for a packet before it raises ``BlockingIOError``.
-
-        Args:
-            seconds: The limit [s]; 0 waits for ever.
-        """
+        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0: for ever."""
         set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
 
     def transmit(self, packet: bytes) -> None:
-        """Send a packet without waiting. Any thread.
-
-        Raises:
-            OSError: The application's buffer is full, or the application is gone.
-        """
+        """Send a packet without waiting. Any thread. ``OSError``: the application's buffer is full, or it is gone."""
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
-        """Send a packet with a file descriptor, without waiting. Any thread.
-
-        Raises:
-            OSError: The application's buffer is full, or the application is gone.
-        """
+        """Send a packet with a file descriptor, like :meth:`transmit`."""
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", (descriptor,)))
         self._socket.sendmsg((packet,), (rights,), SEND_FLAGS)
 
     def hang_up(self, reason: str) -> None:
-        """End the connection and send the reason to the application. Any thread.
-
-        To the receiving thread, this is like any other end.
-        """
+        """End the connection with a reason. Any thread. To the receiving thread, this is like any other end."""
         if not self.ending:
             self.reason = self.reason or reason
             self.ending = True
