@@ -58,21 +58,13 @@ class Part(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """The vehicle's motion at a point in time, in odometry axes.
+    """The vehicle's motion at a point in time, in odometry axes."""
 
-    Attributes:
-        at_ns: Time of the motion on the proxy's clock.
-        position: Shape (3,) [m].
-        velocity: Shape (3,) [m/s].
-        yaw: [rad]
-        yaw_rate: [rad/s]
-    """
-
-    at_ns: int
-    position: Array
-    velocity: Array
-    yaw: float
-    yaw_rate: float
+    at_ns: int  #: time of the motion on the proxy's clock
+    position: Array  #: shape (3,) [m]
+    velocity: Array  #: shape (3,) [m/s]
+    yaw: float  #: [rad]
+    yaw_rate: float  #: [rad/s]
 
     def moved_to(self, at_ns: int) -> Motion:
         """Return the motion extrapolated to another time, by at most 0.3 s forward or back."""

@@ -54,23 +54,16 @@ class _Now(NamedTuple):
 
 
 class ChaseLaw:
-    """Computes set-points from the vehicle's motion and the target's state.
-
-    Attributes:
-        settings: Settings of the law; can be replaced in flight.
-        mode: Mode of the pursuit; can be changed in flight.
-        phase: Phase at the last step.
-        off_m: Estimated minus wanted distance at the last step; None while the target is not in sight.
-        held_by: The constraint that keeps the vehicle from its goal ("leash"); empty if there is none.
-    """
+    """Computes set-points from the vehicle's motion and the target's state."""
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
         """Initialise the law."""
-        self.settings = settings or ChaseSettings()
-        self.mode = mode
-        self.phase = TargetPhase.LOOKING
+        self.settings = settings or ChaseSettings()  #: settings of the law; can be replaced in flight
+        self.mode = mode  #: mode of the pursuit; can be changed in flight
+        self.phase = TargetPhase.LOOKING  #: phase at the last step
+        #: estimated minus wanted distance at the last step; None while the target is not in sight
         self.off_m: float | None = None
-        self.held_by = ""
+        self.held_by = ""  #: the constraint that keeps the vehicle from its goal ("leash"); empty if there is none
         self._heading: float | None = None  # heading of the target's last motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
         self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes

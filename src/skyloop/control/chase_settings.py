@@ -41,81 +41,53 @@ LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SE
 class ChaseSettings:
     """Goals, gains and limits of :class:`ChaseLaw`.
 
-    Attributes:
-        distance_m: Horizontal distance between the centres of the vehicle and the target.
-        nearest_m: Minimum distance to the target; the vehicle backs off from a target that comes closer.
-        clear_m: Minimum distance to other objects that the detector sees.
-        bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0
-            is in front of it, π behind it, π/2 on its left. None for the side that the vehicle is on.
-        orbit_m_s: Speed around the target; positive for counter-clockwise as seen from above.
-        leash_m: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
-            None for no leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
-        height_m: Height above the ground; None for the height at the start.
-        lowest_m: Minimum height above the ground.
-        highest_m: Maximum height above the ground.
-        parallax_m: How far to rise (or sink, if it can't rise) and return in order to measure the range of a target
-            that may not be on the ground. None waits for the range without moving.
-        steep_rad: Maximum elevation of the target's middle, up or down, at which the vehicle keeps its height.
-        lead_s: Total delay of commands and feedback, from the decision until a command takes effect.
-        response_s: Time to reach a commanded velocity, for which the target's velocity is predicted ahead.
-        range_gain: [1/s]
-        velocity_gain: Acceleration per unit of velocity error [1/s].
-        yaw_gain: [1/s]
-        height_gain: [1/s]
-        round_gain: Gain of moving around to ``bearing_rad`` [1/s].
-        speed_m_s: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
-        climb_m_s: Maximum vertical speed.
-        turn_rad_s: Maximum yaw rate.
-        acceleration_m_s2: Limit of the horizontal set-point; more acceleration would tilt the camera off the target.
-        react_s: The vehicle's worst-case reaction time; limits the closing speed so that it can stop in time.
-        brake_m_s2: Deceleration assumed for that stop.
-        tilt_rad: Maximum tilt of a vehicle flown by attitude.
-        tilt_gain: Acceleration per unit of velocity error of a vehicle flown by attitude [1/s].
-        lean_rad: Maximum lean that the model expects of a vehicle flown by velocity.
-        seen_s: Time after the last sighting for which the target still counts as seen.
-        predict_s: Time to follow a hidden target's predicted motion while slowing down.
-        hover_s: Time to hover after that, looking to either side of the target's predicted position.
-        give_up_s: Time after the last sighting at which to give up.
-        search_rad_s: Yaw rate during the search.
-        sweep_rad: Angle to look past the target's predicted position while hovering.
-
     Raises:
         UsageError: A number is out of its range, or ``distance_m`` is not greater than ``nearest_m``.
     """
 
-    distance_m: float = 4.0
-    nearest_m: float = 2.0
-    clear_m: float = 1.5
+    distance_m: float = 4.0  #: horizontal distance between the centres of the vehicle and the target
+    nearest_m: float = 2.0  #: minimum distance to the target; the vehicle backs off from a target that comes closer
+    clear_m: float = 1.5  #: minimum distance to other objects that the detector sees
+    #: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is in front of it, π
+    #: behind it, π/2 on its left. None for the side that the vehicle is on.
     bearing_rad: float | None = None
-    orbit_m_s: float = 0.8
+    orbit_m_s: float = 0.8  #: speed around the target; positive for counter-clockwise as seen from above
+    #: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches. None for no
+    #: leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
     leash_m: float | None = None
-    height_m: float | None = None
-    lowest_m: float = 0.8
-    highest_m: float = 4.0
+    height_m: float | None = None  #: height above the ground; None for the height at the start
+    lowest_m: float = 0.8  #: minimum height above the ground
+    highest_m: float = 4.0  #: maximum height above the ground
+    #: How far to rise (or sink, if it can't rise) and return in order to measure the range of a target that may not be
+    #: on the ground. None waits for the range without moving.
     parallax_m: float | None = 0.4
+    #: maximum elevation of the target's middle, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
-    lead_s: float = 0.12
-    response_s: float = 0.4
-    range_gain: float = 1.0
-    velocity_gain: float = 3.0
-    yaw_gain: float = 2.2
-    height_gain: float = 1.0
-    round_gain: float = 1.2
+    lead_s: float = 0.12  #: total delay of commands and feedback, from the decision until a command takes effect
+    response_s: float = 0.4  #: time to reach a commanded velocity, for which the target's velocity is predicted ahead
+    range_gain: float = 1.0  #: [1/s]
+    velocity_gain: float = 3.0  #: acceleration per unit of velocity error [1/s]
+    yaw_gain: float = 2.2  #: [1/s]
+    height_gain: float = 1.0  #: [1/s]
+    round_gain: float = 1.2  #: gain of moving around to ``bearing_rad`` [1/s]
+    #: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
     speed_m_s: float = 4.0
-    climb_m_s: float = 0.6
-    turn_rad_s: float = 1.8
+    climb_m_s: float = 0.6  #: maximum vertical speed
+    turn_rad_s: float = 1.8  #: maximum yaw rate
+    #: limit of the horizontal set-point; more acceleration would tilt the camera off the target
     acceleration_m_s2: float = 3.0
+    #: the vehicle's worst-case reaction time; limits the closing speed so that it can stop in time
     react_s: float = 0.5
-    brake_m_s2: float = 1.5
-    tilt_rad: float = 0.33
-    tilt_gain: float = 3.0
-    lean_rad: float = 0.5
-    seen_s: float = 0.4
-    predict_s: float = 2.0
-    hover_s: float = 4.0
-    give_up_s: float = 25.0
-    search_rad_s: float = 0.7
-    sweep_rad: float = 0.6
+    brake_m_s2: float = 1.5  #: deceleration assumed for that stop
+    tilt_rad: float = 0.33  #: maximum tilt of a vehicle flown by attitude
+    tilt_gain: float = 3.0  #: acceleration per unit of velocity error of a vehicle flown by attitude [1/s]
+    lean_rad: float = 0.5  #: maximum lean that the model expects of a vehicle flown by velocity
+    seen_s: float = 0.4  #: time after the last sighting for which the target still counts as seen
+    predict_s: float = 2.0  #: time to follow a hidden target's predicted motion while slowing down
+    hover_s: float = 4.0  #: time to hover after that, looking to either side of the target's predicted position
+    give_up_s: float = 25.0  #: time after the last sighting at which to give up
+    search_rad_s: float = 0.7  #: yaw rate during the search
+    sweep_rad: float = 0.6  #: angle to look past the target's predicted position while hovering
 
     def __post_init__(self) -> None:
         free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m", "parallax_m"}

@@ -86,8 +86,6 @@ class CourseLaw(VelocityLaw):
     Attributes:
         phase: Phase at the last step.
         axis: The vehicle's position in the gate's axes at the last step.
-        way: The points of the route, in odometry axes.
-        stuck: Why the vehicle can't continue; None while it can.
     """
 
     def __init__(
@@ -114,8 +112,8 @@ class CourseLaw(VelocityLaw):
             Part.HEIGHT,
         )
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
-        self.way: list[Point] = []
-        self.stuck: str | None = None
+        self.way: list[Point] = []  #: the points of the route, in odometry axes
+        self.stuck: str | None = None  #: why the vehicle can't continue; None while it can
         self._gates, self._widths = tuple(gates), tuple(widths_m)
         self._shift = np.array([-start[0], -start[1], 0.0])  # from map axes to odometry axes
         self._shift_m = s.start_m

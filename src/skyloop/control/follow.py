@@ -67,25 +67,17 @@ class FollowSettings:
 
 
 class FollowLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        mode: Phase at the last step.
-        station_rad: Wanted angle around the marker from its normal, counter-clockwise as seen from above.
-        station_rate_rad_s: Rate of that angle.
-        off_m: Combined error of distance and height at the last step; None while searching.
-        aside_rad: The vehicle's actual angle, measured like ``station_rad``; None while the marker's normal is unknown.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
         """Initialise the law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
-        self.mode = Mode.SEARCHING
+        self.mode = Mode.SEARCHING  #: phase at the last step
         #: Wanted angle around the marker from its normal, counter-clockwise from above [rad], and its rate [rad/s].
         self.station_rad = 0.0
-        self.station_rate_rad_s = 0.0
+        self.station_rate_rad_s = 0.0  #: rate of that angle
         self.off_m: float | None = None  #: error of distance and height at the last step; None while searching
         self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
         self._target = TargetFilter()

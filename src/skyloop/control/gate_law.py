@@ -89,19 +89,14 @@ class Axis(NamedTuple):
 
 
 class GateLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        axis: The vehicle's position at the last step; None while the gate's position is unknown.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: GateSettings | None = None) -> None:
         """Initialise the law."""
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
-        self.phase = GatePhase.SEARCHING
-        self.axis: Axis | None = None  #: the vehicle's position at the last step
+        self.phase = GatePhase.SEARCHING  #: phase at the last step
+        self.axis: Axis | None = None  #: the vehicle's position at the last step; None while the gate's is unknown
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._gate = _new_filter()
         self._way: Array | None = None  # direction through the gate, horizontal unit vector

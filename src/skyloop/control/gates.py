@@ -48,23 +48,15 @@ FIVE_GATES = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention.
+    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention."""
 
-    Attributes:
-        gates: Gates in order.
-        places: Positions of the gates.
-        poles: Other obstacles.
-        pole_colour: Red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour.
-        start: Take-off position, x and y.
-        map_m: Standard deviation of the positions [m].
-    """
-
-    gates: tuple[GateKind, ...]
-    places: tuple[GatePlace, ...]
-    poles: tuple[Pole, ...] = ()
+    gates: tuple[GateKind, ...]  #: gates in order
+    places: tuple[GatePlace, ...]  #: positions of the gates
+    poles: tuple[Pole, ...] = ()  #: other obstacles
+    #: red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour
     pole_colour: tuple[int, int, int] | None = None
-    start: tuple[float, float] = (0.0, 0.0)
-    map_m: float = 0.05
+    start: tuple[float, float] = (0.0, 0.0)  #: take-off position, x and y
+    map_m: float = 0.05  #: standard deviation of the positions [m]
 
     def __post_init__(self) -> None:
         if len(self.gates) != len(self.places):

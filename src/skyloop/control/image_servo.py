@@ -77,12 +77,7 @@ class ServoSettings:
 
 
 class ImageServoLaw(VelocityLaw):
-    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        error: Root mean square distance between the points and their wanted positions, in the plane at z = 1.
-    """
+    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns]."""
 
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
@@ -104,7 +99,7 @@ class ImageServoLaw(VelocityLaw):
             s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0
         )
         super().__init__(limits, Part.ATTITUDE)
-        self.phase = ServoPhase.SEARCHING
+        self.phase = ServoPhase.SEARCHING  #: phase at the last step
         self.error = math.inf  #: RMS distance between the points and their wanted positions, plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
@@ -285,17 +280,13 @@ class FlowLaw(AirframeLaw):
 
     There is one PID controller per axis: acceleration from the position, its integral and the velocity. The velocity
     comes from a constant-velocity filter over the positions, not from the vehicle.
-
-    Attributes:
-        phase: Phase at the last step.
-        off_m: Estimated distance from the position to hold; None if unknown.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         """Initialise the law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
-        self.phase = FlowPhase.WAITING
+        self.phase = FlowPhase.WAITING  #: phase at the last step
         self.off_m: float | None = None  #: estimated distance from the position to hold; None if unknown
         self._loop = VectorPi(Gains(p=s.gain, i=s.integral), 2, most=0.5 * s.tilt_rad * GRAVITY_M_S2)
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)

@@ -52,23 +52,14 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnEstimate:
-    """A point's motion at a time.
-
-    Attributes:
-        at_ns: Time of the estimate.
-        position: Position, (3,) [m].
-        velocity: Velocity, (3,) [m/s].
-        turn_rate: Turn rate of the horizontal velocity, counter-clockwise from above [rad/s].
-        extra: Horizontal acceleration in addition to the turn's, (2,) [m/s²].
-        covariance: Covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
-    """
+    """A point's motion at a time."""
 
     at_ns: int
-    position: Array
-    velocity: Array
-    turn_rate: float
-    extra: Array
-    covariance: Array
+    position: Array  #: position, (3,) [m]
+    velocity: Array  #: velocity, (3,) [m/s]
+    turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise from above [rad/s]
+    extra: Array  #: horizontal acceleration in addition to the turn's, (2,) [m/s²]
+    covariance: Array  #: covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7)
 
     @property
     def acceleration(self) -> Array:
@@ -97,11 +88,7 @@ _E = TypeVar("_E", Estimate, TurnEstimate)
 
 
 class _Filter(ABC, Generic[_E]):
-    """The common base class of both filters.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """The common base class of both filters."""
 
     def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
         for name, value in finite.items():

@@ -74,19 +74,15 @@ class LandingLaw(AirframeLaw):
 
     Attributes:
         settings: Settings of the law, as given.
-        phase: Phase at the last step.
-        height_m: Height of the feet above the marker at the last step; None while searching.
-        off_m: Horizontal distance from the marker's centre at the last step; None while searching.
-        aborted: Number of aborted touch-downs.
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
         """Initialise the law."""
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
-        self.phase = LandingPhase.SEARCHING
-        self.height_m: float | None = None  #: height of the feet above the marker at the last step
-        self.off_m: float | None = None  #: horizontal distance from the marker's centre at the last step
+        self.phase = LandingPhase.SEARCHING  #: phase at the last step
+        self.height_m: float | None = None  #: height of the feet above the marker; None while searching
+        self.off_m: float | None = None  #: horizontal distance from its centre; None while searching
         self.aborted = 0  #: number of aborted touch-downs
         self._response = VelocityResponse(s.response)
         self._target = TurningTargetFilter()

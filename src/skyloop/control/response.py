@@ -68,21 +68,13 @@ class ResponseSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0.
+    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
 
-    Attributes:
-        at_ns: Time at which the set-point takes effect.
-        moved: Distance moved since the last feedback, (2,) [m].
-        velocity: Velocity, (2,) [m/s].
-        push: Acceleration caused by the air, (2,) [m/s²].
-        trim: Acceleration that the loop adds to what the velocity error demands, (2,) [m/s²].
-    """
-
-    at_ns: int
-    moved: Array
-    velocity: Array
-    push: Array
-    trim: Array
+    at_ns: int  #: time at which the set-point takes effect
+    moved: Array  #: distance moved since the last feedback, (2,) [m]
+    velocity: Array  #: velocity, (2,) [m/s]
+    push: Array  #: acceleration caused by the air, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop adds to what the velocity error demands, (2,) [m/s²]
 
 
 class VelocityResponse:

@@ -207,33 +207,20 @@ def checked(route: Route) -> Route:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The conditions against which a route is checked.
+    """The conditions against which a route is checked."""
 
-    Attributes:
-        space: Where flying is allowed.
-        start: Start of the route [m]: the vehicle's position, or above it before take-off; None if unknown.
-        problem: Why the vehicle can't be flown by position; empty if it can.
-        ground_m: Height of the ground in world axes; None if unknown.
-        battery: Current charge, 0 to 1; None if unknown.
-        speed_m_s: Maximum horizontal speed.
-        climb_m_s: Maximum speed up or down.
-        altitude_m: Maximum height above the ground.
-        battery_warn: Charge below which the vehicle warns.
-        battery_land: Charge below which the vehicle lands.
-        flight_time_s: Flight time with a full battery.
-    """
-
-    space: Space = field(default_factory=Space)
+    space: Space = field(default_factory=Space)  #: where flying is allowed
+    #: start of the route [m]: the vehicle's position, or above it before take-off; None if unknown
     start: Vector | None = None
-    problem: str = ""
-    ground_m: float | None = None
-    battery: float | None = None
-    speed_m_s: float = 2.0
-    climb_m_s: float = 1.0
-    altitude_m: float = 5.0
-    battery_warn: float = 0.2
-    battery_land: float = 0.1
-    flight_time_s: float = 600.0
+    problem: str = ""  #: why the vehicle can't be flown by position; empty if it can
+    ground_m: float | None = None  #: height of the ground in world axes; None if unknown
+    battery: float | None = None  #: current charge, 0 to 1; None if unknown
+    speed_m_s: float = 2.0  #: maximum horizontal speed
+    climb_m_s: float = 1.0  #: maximum speed up or down
+    altitude_m: float = 5.0  #: maximum height above the ground
+    battery_warn: float = 0.2  #: charge below which the vehicle warns
+    battery_land: float = 0.1  #: charge below which the vehicle lands
+    flight_time_s: float = 600.0  #: flight time with a full battery
 
 
 class Finding(msgspec.Struct, frozen=True):

@@ -96,18 +96,13 @@ class RouteLaw:
 
     Args:
         route: The route.
-
-    Attributes:
-        state: State of the flight.
-        index: Index of the next or current waypoint, from 0; past the last one on the way back.
-        problem: Why the law paused without being asked to; empty otherwise.
     """
 
     def __init__(self, route: Route) -> None:
         self.route = route
-        self.state = RouteState.READY
-        self.index = 0
-        self.problem = ""
+        self.state = RouteState.READY  #: state of the flight
+        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the way back
+        self.problem = ""  #: why the law paused without being asked to; empty otherwise
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
         self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun

@@ -54,22 +54,17 @@ def _is_number(value: object) -> bool:
 class Traits:
     """Prior knowledge about a kind of target.
 
-    Attributes:
-        height_m: Height; None if unknown.
-        height_share: Standard deviation of the height, as a fraction of the height.
-        radius_m: Distance from the target's middle to its visible lower edge.
-        intensity_m2_s3: Intensity of the random acceleration; its root is the change of the velocity within a second.
-        on_ground: Whether the target is on the ground. None assumes so for a target with a class; for others it is one
-            hypothesis among several (:mod:`.target_range`).
-
     Raises:
         UsageError: A number is out of its range.
     """
 
     height_m: float | None = None
-    height_share: float = 0.1
-    radius_m: float = 0.0
+    height_share: float = 0.1  #: standard deviation of the height, as a fraction of the height
+    radius_m: float = 0.0  #: distance from the target's middle to its visible lower edge
+    #: intensity of the random acceleration; its root is the change of the velocity within a second
     intensity_m2_s3: float = 1.0
+    #: Whether the target is on the ground. None assumes so for a target with a class; for others it is one hypothesis
+    #: among several (:mod:`.target_range`).
     on_ground: bool | None = None
 
     def __post_init__(self) -> None:
@@ -96,29 +91,17 @@ UNKNOWN: Final = Traits(radius_m=0.1)  #: a target without a class
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """The state of a target at a point in time.
+    """The state of a target at a point in time."""
 
-    Attributes:
-        at_ns: Time of the state on the proxy's clock.
-        foot: Position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground.
-        velocity: Horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own.
-        height_m: Height of the target.
-        place_m: Standard deviation of the position: the root of the sum of the horizontal variances.
-        range_m: Horizontal distance from the camera that last saw the target.
-        range_deviation_m: Standard deviation along the line of sight.
-        range_known: Whether the range is good enough to fly by; False if it is only a guess.
-        margin_m: Extra distance to keep because the target may be closer; 0 for a target on the ground.
-    """
-
-    at_ns: int
-    foot: Array
-    velocity: Array
+    at_ns: int  #: time of the state on the proxy's clock
+    foot: Array  #: position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground
+    velocity: Array  #: horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own
     height_m: float
-    place_m: float
-    range_m: float
-    range_deviation_m: float
-    range_known: bool = True
-    margin_m: float = 0.0
+    place_m: float  #: standard deviation of the position: the root of the sum of the horizontal variances
+    range_m: float  #: horizontal distance from the camera that last saw the target
+    range_deviation_m: float  #: standard deviation along the line of sight
+    range_known: bool = True  #: whether the range is good enough to fly by; False if it is only a guess
+    margin_m: float = 0.0  #: extra distance to keep because the target may be closer; 0 for a target on the ground
 
     @property
     def middle(self) -> Array:
@@ -133,13 +116,7 @@ class _Estimate(NamedTuple):
 
 
 class TargetEstimator:
-    """The filter for one target.
-
-    Attributes:
-        traits: Prior knowledge about the target.
-        refused: Number of consecutive boxes that did not fit.
-        seen_ns: Capture time of the last box that fit; None before :meth:`start`.
-    """
+    """The filter for one target."""
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
         """Initialise the filter.
@@ -150,9 +127,9 @@ class TargetEstimator:
             relative: Whether the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
                 target's motion.
         """
-        self.traits = traits
-        self.refused = 0
-        self.seen_ns: int | None = None
+        self.traits = traits  #: prior knowledge about the target
+        self.refused = 0  #: number of consecutive boxes that did not fit
+        self.seen_ns: int | None = None  #: capture time of the last box that fit; None before :meth:`start`
         self._nominal_m, self._relative = nominal_m, relative
         self._intensity = traits.intensity_m2_s3 + (_RECKONING_M2_S3 if relative else 0.0)
         self._at_ns = 0

@@ -68,13 +68,7 @@ class _Seen:
 
 
 class TargetFinder:
-    """Finds a target in a sequence of images.
-
-    Attributes:
-        estimator: The target's motion; None before the first sighting.
-        class_name: Class of the target, if it is known.
-        detections: Detections in the newest image searched by a detector.
-    """
+    """Finds a target in a sequence of images."""
 
     def __init__(
         self,
@@ -100,9 +94,9 @@ class TargetFinder:
         """
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
-        self.estimator: TargetEstimator | None = None
+        self.estimator: TargetEstimator | None = None  #: the target's motion; None before the first sighting
         self.class_name = class_name
-        self.detections: tuple[Detection, ...] = ()
+        self.detections: tuple[Detection, ...] = ()  #: detections in the newest image searched by a detector
         self._first_box = box
         self._given, self._unnamed = traits, class_name is None
         self._nominal_m, self._relative = nominal_m, relative

@@ -66,12 +66,7 @@ class FollowStatus:
 
 
 class TargetFollower(AirframeLaw):
-    """Follows a target. Call it from one thread.
-
-    Attributes:
-        mode: How to follow the target; can be changed in flight.
-        over: Whether the follower gave up because the target was lost for too long.
-    """
+    """Follows a target. Call it from one thread."""
 
     def __init__(
         self,

@@ -32,24 +32,15 @@ _UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, from encoding, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """The pose of a camera when it captured an image.
+    """The pose of a camera when it captured an image."""
 
-    Attributes:
-        position: Position in odometry axes, (3,) [m]; the third value is the height above the ground, if known.
-        rotation: Rotation from optical axes to odometry axes, (3, 3).
-        intrinsics: Intrinsics of the image.
-        size: Width and height of the image [px].
-        yaw_rad: Standard deviation of the yaw at the time of capture.
-        tilt_rad: Standard deviation of the tilt.
-        rise_m: Climb by the vehicle's integrated velocity, regardless of the ground [m]; None if unknown.
-    """
-
-    position: Array
-    rotation: Array
+    position: Array  #: position in odometry axes, (3,) [m]; the third value is the height above the ground, if known
+    rotation: Array  #: rotation from optical axes to odometry axes, (3, 3)
     intrinsics: Intrinsics
-    size: tuple[int, int]
-    yaw_rad: float = _YAW_RAD
-    tilt_rad: float = _TILT_RAD
+    size: tuple[int, int]  #: width and height of the image [px]
+    yaw_rad: float = _YAW_RAD  #: standard deviation of the yaw at the time of capture
+    tilt_rad: float = _TILT_RAD  #: standard deviation of the tilt
+    #: climb by the vehicle's integrated velocity, regardless of the ground [m]; None if unknown
     rise_m: float | None = None
 
     @classmethod
@@ -112,27 +103,18 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxView:
-    """The directions of a box's middle and edges.
+    """The directions of a box's middle and edges."""
 
-    Attributes:
-        azimuth: Azimuth of the middle, counter-clockwise from x of odometry axes [rad].
-        bottom: Tangent of the lower edge's elevation; None if the image cuts it off.
-        top: Tangent of the upper edge's elevation; None if the image cuts it off.
-        below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None.
-        above: If the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None.
-        azimuth_rad: Standard deviation of the azimuth.
-        edge: Standard deviation of each edge, independent of the other.
-        tilt: Standard deviation common to both edges.
-    """
-
-    azimuth: float
-    bottom: float | None
-    top: float | None
-    azimuth_rad: float
-    edge: float
+    azimuth: float  #: azimuth of the middle, counter-clockwise from x of odometry axes [rad]
+    bottom: float | None  #: tangent of the lower edge's elevation; None if the image cuts it off
+    top: float | None  #: tangent of the upper edge's elevation; None if the image cuts it off
+    azimuth_rad: float  #: standard deviation of the azimuth
+    edge: float  #: standard deviation of each edge, independent of the other
+    #: if the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None
     below: float | None = None
+    #: if the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None
     above: float | None = None
-    tilt: float = _TILT_RAD
+    tilt: float = _TILT_RAD  #: standard deviation common to both edges
 
     @classmethod
     def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:

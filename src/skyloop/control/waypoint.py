@@ -27,20 +27,14 @@ if TYPE_CHECKING:
 class Waypoint:
     """A position in world axes, and optionally a yaw.
 
-    Attributes:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None leaves it free.
-
     Raises:
         UsageError: A number is not finite.
     """
 
-    x: float
-    y: float
-    z: float
-    yaw: float | None = None
+    x: float  #: east [m]
+    y: float  #: north [m]
+    z: float  #: up [m]
+    yaw: float | None = None  #: counter-clockwise from x [rad]; None leaves it free
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z", "yaw"):

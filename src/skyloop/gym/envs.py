@@ -54,11 +54,7 @@ _CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 
 
 class _Observer:
-    """Makes observations in the requested form for all drones of a task.
-
-    Attributes:
-        space: The observation space of one drone.
-    """
+    """Makes observations in the requested form for all drones of a task."""
 
     def __init__(self, task: Reaching, form: Observe, size_px: int) -> None:
         if form not in get_args(Observe):
@@ -72,7 +68,7 @@ class _Observer:
             "pixels": pixels,
             "both": spaces.Dict({"pixels": pixels, "motion": MOTIONS}),
         }
-        self.space = choices[form]
+        self.space = choices[form]  #: the observation space of one drone
         self._size_px = size_px
         self._task = task
         self._form = form

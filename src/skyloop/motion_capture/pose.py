@@ -239,11 +239,6 @@ class Track:
 
     The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
     by half the window and has much less noise than the difference between two poses.
-
-    Attributes:
-        body: The body's name.
-        state: Whether the body is tracked.
-        pose: The newest pose while the body is tracked, otherwise None.
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
@@ -254,7 +249,7 @@ class Track:
             may_freeze: Whether the pose may stay constant, as in a simulator without noise.
         """
         self.body = body
-        self.state = TrackState.WAITING
+        self.state = TrackState.WAITING  #: whether the body is tracked
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
         self._may_freeze = may_freeze
         self._recent: deque[tuple[int, Vector]] = deque()

@@ -44,16 +44,11 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """The pose of a camera in the world.
+    """The pose of a camera in the world."""
 
-    Attributes:
-        position_m: Position of the optical centre, shape (3,).
-        rotation: Rotation from optical to world axes, shape (3, 3).
-        drone: Number of the drone that carries the camera and is not rendered itself; None for a free camera.
-    """
-
-    position_m: NDArray[np.float64]
-    rotation: NDArray[np.float64]
+    position_m: NDArray[np.float64]  #: position of the optical centre, shape (3,)
+    rotation: NDArray[np.float64]  #: rotation from optical to world axes, shape (3, 3)
+    #: number of the drone that carries the camera and is not rendered itself; None for a free camera
     drone: int | None = None
 
 

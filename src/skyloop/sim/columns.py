@@ -33,37 +33,27 @@ def columns(rows: int, drones: int) -> Floats:
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns`, as plain floats for a few drones.
-
-    Attributes:
-        read: One function per drone that returns the drone's numbers.
-        write: One function per drone that replaces its numbers; it takes as many numbers.
-    """
+    """Consecutive rows of an array made by :func:`columns`, as plain floats for a few drones."""
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
         rows, drones = table.shape
         memory = memoryview(table.T).cast("B")  # type: ignore[arg-type]
         offsets = [(drone * rows + first) * table.itemsize for drone in range(drones)]
         numbers = Struct(f"{count}d")
+        #: one function per drone that returns the drone's numbers
         self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
+        #: one function per drone that replaces its numbers; it takes as many numbers
         self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
 
 
 @dataclass(frozen=True, slots=True)
 class Operations:
-    """Operations that differ between numbers and arrays, so that one formula works for both.
+    """Operations that differ between numbers and arrays, so that one formula works for both."""
 
-    Attributes:
-        least: The smaller of two values.
-        most: The larger of two values.
-        root: The square root.
-        choose: The second value where the first is true, otherwise the third.
-    """
-
-    least: Callable[[N, N], N]
-    most: Callable[[N, N], N]
-    root: Callable[[N], N]
-    choose: Callable[[N, N, N], N]
+    least: Callable[[N, N], N]  #: the smaller of two values
+    most: Callable[[N, N], N]  #: the larger of two values
+    root: Callable[[N], N]  #: the square root
+    choose: Callable[[N, N, N], N]  #: the second value where the first is true, otherwise the third
 
 
 NUMBERS: Final = Operations(min, max, math.sqrt, lambda condition, one, other: one if condition else other)

@@ -52,11 +52,6 @@ class SimHost:
     """Several drones in one world, numbered from 0, each with one :class:`Observer`: a driver or emulated firmware.
 
     The world is stepped while at least one observer is attached.
-
-    Attributes:
-        options: Options of the world and its drones.
-        wind: The current wind.
-        simulation: The simulation of the world.
     """
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
@@ -71,7 +66,7 @@ class SimHost:
             UnknownNameError: There is no such world.
             FileFormatError: The world's file is invalid.
         """
-        self.options = options or SimOptions()
+        self.options = options or SimOptions()  #: options of the world and its drones
         world = self.options.load_world()
         self.wind = self.options.blowing(world.wind)  #: the current wind
         self.simulation = Simulation(

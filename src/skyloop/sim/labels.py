@@ -32,21 +32,14 @@ _LONGEST_STEP_S = 20.0  # maximum time between two images of ``pictures``; track
 
 @dataclass(frozen=True, slots=True)
 class TargetBox:
-    """An object's box in an image.
+    """An object's box in an image."""
 
-    Attributes:
-        name: Name of the target or box in the world.
-        class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
-        box: x, y of the upper left corner, width and height [px] of the object's whole extent within the image.
-        visible: Fraction of the object's pixels within the image that are not occluded, 0 to 1.
-        cut: Whether the image's edge may cut the object off, because it reaches the outermost pixels.
-    """
-
-    name: str
-    class_name: str
+    name: str  #: name of the target or box in the world
+    class_name: str  #: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``
+    #: x, y of the upper left corner, width and height [px] of the object's whole extent within the image
     box: tuple[int, int, int, int]
-    visible: float
-    cut: bool
+    visible: float  #: fraction of the object's pixels within the image that are not occluded, 0 to 1
+    cut: bool  #: whether the image's edge may cut the object off, because it reaches the outermost pixels
 
 
 class Labeller:

@@ -24,44 +24,25 @@ MOST_LAG_S: Final = 0.25  #: default for the lag behind the clock beyond which s
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """Options for a simulated world and its drones.
+    """Options for a simulated world and its drones."""
 
-    Attributes:
-        world: Name of a built-in world, or path of a world file.
-        seed: Seed for all noise and gusts.
-        speed: Ratio of simulated to real time.
-        cameras: The cameras of each drone.
-        noise: Factor on the sensors' noise and biases.
-        wind: Factor on the world's wind.
-        battery: Charge at the start, 0 to 1.
-        quality: Image quality: ``fast``, ``smooth`` or ``best``.
-        native: Actions that the drone's driver supports natively.
-        position: Whether the drone reports its position.
-        velocity: Whether the drone reports its velocity, which it always uses for its own flight.
-        truth: Whether the drone also reports its true state.
-        rate_hz: Number of reports per second.
-        most_lag_s: Maximum lag of the world behind the clock before it skips steps [s].
-        parameters: The vehicles' parameters.
-        autopilot: Real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
-        autopilot_folder: Folder for the firmware's settings; None to keep them only as long as the drone exists.
-    """
-
-    world: str = "room"
-    seed: int = 0
-    speed: float = 1.0
+    world: str = "room"  #: name of a built-in world, or path of a world file
+    seed: int = 0  #: seed for all noise and gusts
+    speed: float = 1.0  #: ratio of simulated to real time
     cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
-    noise: float = 1.0
-    wind: float = 1.0
-    battery: float = 1.0
-    quality: str = "smooth"
-    native: frozenset[str] = EVERY_ACTION
-    position: bool = True
-    velocity: bool = True
-    truth: bool = True
-    rate_hz: float = 40.0
-    most_lag_s: float = MOST_LAG_S
+    noise: float = 1.0  #: factor on the sensors' noise and biases
+    wind: float = 1.0  #: factor on the world's wind
+    battery: float = 1.0  #: charge at the start, 0 to 1
+    quality: str = "smooth"  #: image quality: ``fast``, ``smooth`` or ``best``
+    native: frozenset[str] = EVERY_ACTION  #: actions that the drone's driver supports natively
+    position: bool = True  #: whether the drone reports its position
+    velocity: bool = True  #: whether the drone reports its velocity, which it always uses for its own flight
+    truth: bool = True  #: whether the drone also reports its true state
+    rate_hz: float = 40.0  #: number of reports per second
+    most_lag_s: float = MOST_LAG_S  #: maximum lag of the world behind the clock before it skips steps [s]
     parameters: VehicleParameters = STANDARD_VEHICLE
-    autopilot: str | None = None
+    autopilot: str | None = None  #: real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``
+    #: folder for the firmware's settings; None to keep them only as long as the drone exists
     autopilot_folder: str | None = None
 
     def load_world(self) -> World:

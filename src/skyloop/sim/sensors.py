@@ -32,13 +32,7 @@ _ESTIMATE_NOISE: tuple[_Value, ...] = (lambda p: p.altitude_noise_m, *[lambda p:
 
 
 class Sensors:
-    """The sensors of all drones.
-
-    Attributes:
-        altitude: Height of the feet above the floor, (n,) [m].
-        velocity: Velocity forward, left, up in levelled axes, (3, n) [m/s].
-        numbers: For a few drones: altitude and velocity.
-    """
+    """The sensors of all drones."""
 
     def __init__(
         self, parameters: Sequence[VehicleParameters], bodies: BodyTable, seed: int, bias_period_s: float
@@ -58,11 +52,11 @@ class Sensors:
         self._inertial = np.empty((9, n))
         self._inertial_step = -1
         self._estimate = columns(4, n)
-        self.altitude: Floats = self._estimate[0]
-        self.velocity: Floats = self._estimate[1:]
+        self.altitude: Floats = self._estimate[0]  #: height of the feet above the floor, (n,) [m]
+        self.velocity: Floats = self._estimate[1:]  #: velocity forward, left, up in levelled axes, (3, n) [m/s]
         self._few = few(n)
         if self._few:
-            self.numbers = Fields(self._estimate, 0, 4)
+            self.numbers = Fields(self._estimate, 0, 4)  #: for a few drones: altitude and velocity
             self._each = list(enumerate(self._half_height.tolist()))
         self.estimate()
 

@@ -40,13 +40,7 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query.
-
-    Attributes:
-        world: The world.
-        parameters: The parameters of each drone.
-        seed: Seed for all noise and gusts.
-    """
+    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query."""
 
     def __init__(
         self,
@@ -80,8 +74,8 @@ class Simulation:
         if not 0 < charge <= 1:
             raise UsageError(f"charge must be greater than 0 and at most 1, not {charge!r}")
         self.world = world
-        self.parameters = _one_each(parameters, drones, "parameters")
-        self.seed = world.seed if seed is None else seed
+        self.parameters = _one_each(parameters, drones, "parameters")  #: the parameters of each drone
+        self.seed = world.seed if seed is None else seed  #: seed for all noise and gusts
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
         self._lock = threading.RLock()

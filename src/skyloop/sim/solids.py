@@ -17,19 +17,12 @@ from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Spawn, Vec
 
 
 class Overlap(NamedTuple):
-    """A drone's overlap with a solid or with the room's walls and ceiling.
+    """A drone's overlap with a solid or with the room's walls and ceiling."""
 
-    Attributes:
-        normal: Direction out of the solid.
-        depth_m: Depth along that direction.
-        surface_m_s: Velocity of the solid's surface at the drone's centre.
-        spin_rad_s: Turn rate of the surface, counter-clockwise from above.
-    """
-
-    normal: Vec3
-    depth_m: float
-    surface_m_s: Vec3 = (0.0, 0.0, 0.0)
-    spin_rad_s: float = 0.0
+    normal: Vec3  #: direction out of the solid
+    depth_m: float  #: depth along that direction
+    surface_m_s: Vec3 = (0.0, 0.0, 0.0)  #: velocity of the solid's surface at the drone's centre
+    spin_rad_s: float = 0.0  #: turn rate of the surface, counter-clockwise from above
 
 
 class Solids:

@@ -115,21 +115,13 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A rectangular frame to fly through.
-
-    Attributes:
-        name: The gate's name.
-        position_m: Position of the opening's centre.
-        inner_size_m: Width and height of the opening.
-        yaw_rad: Heading for flying through the gate.
-        frame_m: Thickness of the bars.
-    """
+    """A rectangular frame to fly through."""
 
     name: str
-    position_m: Vec3
-    inner_size_m: Vec2
-    yaw_rad: float = 0.0
-    frame_m: float = 0.08
+    position_m: Vec3  #: position of the opening's centre
+    inner_size_m: Vec2  #: width and height of the opening
+    yaw_rad: float = 0.0  #: heading for flying through the gate
+    frame_m: float = 0.08  #: thickness of the bars
     colour: Rgb = (235, 110, 20)
 
     def bars(self) -> tuple[Box, ...]:
@@ -336,24 +328,16 @@ class FigureTarget:
     """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
     The path is that of the middle of its footprint (z is the ground below), and the yaw is its heading.
-
-    Attributes:
-        name: The target's name.
-        shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
-        path: Its path.
-        yaw: Its heading.
-        size_m: Size along the figure's own x (ahead), y (left) and z.
-        look: Number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes.
-        colour: Colour of a person's top or a car's body; None for the look's colour.
     """
 
     name: str
-    shape: str
+    shape: str  #: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`
     path: Path
     yaw: Yaw
-    size_m: Vec3
+    size_m: Vec3  #: size along the figure's own x (ahead), y (left) and z
+    #: number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes
     look: int = 0
-    colour: Rgb | None = None
+    colour: Rgb | None = None  #: colour of a person's top or a car's body; None for the look's colour
 
 
 Target = BoardTarget | PlatformTarget | FigureTarget

@@ -271,17 +271,11 @@ def _along(edge: Array, begin: Array, end: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoleSighting:
-    """One pole in one image.
+    """One pole in one image."""
 
-    Attributes:
-        top: The middle of the pole's upper end, (2,) pixels.
-        ray: Ray through the top, in optical axes, (3,), z = 1.
-        width_px: Width at half the pole's height.
-    """
-
-    top: Array
-    ray: Array
-    width_px: float
+    top: Array  #: the middle of the pole's upper end, (2,) pixels
+    ray: Array  #: ray through the top, in optical axes, (3,), z = 1
+    width_px: float  #: width at half the pole's height
 
     def ray_in_body(self, camera: CameraInfo) -> Array:
         """Return the ray in body axes, (3,)."""

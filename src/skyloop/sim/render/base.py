@@ -26,15 +26,10 @@ class SceneState:
 
     The renderer may cache results for as long as it receives the same state object, so don't write to a state's arrays
     afterwards.
-
-    Attributes:
-        drone_positions_m: Positions of the bodies' origins in world axes, shape (n, 3).
-        drone_rotations: World from body, shape (n, 3, 3).
-        targets: One state for each target in the world, in the world's order.
-        light: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
     """
 
-    drone_positions_m: NDArray[np.float64]
-    drone_rotations: NDArray[np.float64]
-    targets: tuple[TargetState, ...] = ()
+    drone_positions_m: NDArray[np.float64]  #: positions of the bodies' origins in world axes, shape (n, 3)
+    drone_rotations: NDArray[np.float64]  #: world from body, shape (n, 3, 3)
+    targets: tuple[TargetState, ...] = ()  #: one state for each target in the world, in the world's order
+    #: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
     light: float = 1.0

@@ -49,21 +49,14 @@ _TYRE: Rgb = (34, 34, 36)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figure:
-    """A figure's parts: the rigid body, and limbs that swing about their upper ends.
-
-    Attributes:
-        body: The rigid body.
-        limbs: Equally large groups of quads, one per joint, each with its joint as origin; None without limbs.
-        joints: Positions of the joints, (limbs, 3).
-        swings: Forward swing of each limb in the middle of a step [rad], (limbs,).
-        spots: Circles that make up the shadow: x, y, radius [m].
-    """
+    """A figure's parts: the rigid body, and limbs that swing about their upper ends."""
 
     body: Quads
+    #: equally large groups of quads, one per joint, each with its joint as origin; None without limbs
     limbs: Quads | None
-    joints: Floats
-    swings: Floats
-    spots: tuple[Vec3, ...]
+    joints: Floats  #: positions of the joints, (limbs, 3)
+    swings: Floats  #: forward swing of each limb in the middle of a step [rad], (limbs,)
+    spots: tuple[Vec3, ...]  #: circles that make up the shadow: x, y, radius [m]
 
     def posed(self, position_m: Floats, rotation: Floats, walked_m: float) -> Quads:
         """Return the figure at a position after a distance walked [m]; the swing starts and stops with the walk."""

@@ -138,14 +138,10 @@ _PAPER = 235
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """An image of a marker.
+    """An image of a marker."""
 
-    Attributes:
-        image: The image, BGR.
-        uv: The visible part of the image: left, top, right, bottom in fractional texels.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  #: the image, BGR
+    #: the visible part of the image: left, top, right, bottom in fractional texels
     uv: tuple[float, float, float, float]
 
 

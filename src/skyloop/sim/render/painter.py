@@ -25,27 +25,19 @@ class Raster:
 
     A pixel has one sample, the grid point nearest to its centre, or the four around its centre. Without distortion,
     these are exactly a quarter of a pixel to each side.
-
-    Attributes:
-        grid: The grid.
-        samples: Samples per pixel: 1 or 4.
-        lookup: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two
-            below these.
-        to_grid: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the
-            start, gives the column and row of its first sample after truncation. Computed in single precision, like
-            ``lookup``.
-        sample_x: x/z of each column of the grid.
-        sample_y: y/z of each row of the grid.
-        rays: Rays of the pixels' centres.
     """
 
     grid: Grid
-    samples: int
+    samples: int  #: samples per pixel: 1 or 4
+    #: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two below
+    #: these.
     lookup: NDArray[np.int32]
+    #: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the start,
+    #: gives the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
     to_grid: NDArray[np.float32]
-    sample_x: NDArray[np.float32]
-    sample_y: NDArray[np.float32]
-    rays: Rays
+    sample_x: NDArray[np.float32]  #: x/z of each column of the grid
+    sample_y: NDArray[np.float32]  #: y/z of each row of the grid
+    rays: Rays  #: rays of the pixels' centres
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:

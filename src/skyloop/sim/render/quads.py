@@ -31,19 +31,12 @@ class Texture:
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """All textures in one image.
+    """All textures in one image."""
 
-    Attributes:
-        image: The image, BGRA (OpenCV samples four channels twice as fast as three).
-        x0: Column where each texture's level 0 starts; float64, shape (number of textures,).
-        y0: Row where each texture's level 0 starts, likewise.
-        span: Twice the padded width of each texture.
-    """
-
-    image: NDArray[np.uint8]
-    x0: NDArray[np.float64]
-    y0: NDArray[np.float64]
-    span: NDArray[np.float64]
+    image: NDArray[np.uint8]  #: the image, BGRA (OpenCV samples four channels twice as fast as three)
+    x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
+    y0: NDArray[np.float64]  #: row where each texture's level 0 starts, likewise
+    span: NDArray[np.float64]  #: twice the padded width of each texture
 
 
 class AtlasBuilder:

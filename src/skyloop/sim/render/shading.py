@@ -160,17 +160,11 @@ _NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A level round spot that gets less light.
+    """A level round spot that gets less light."""
 
-    Attributes:
-        centre_m: Centre in world axes.
-        radius_m: Radius of the edge.
-        strength: Fraction of the light missing in the middle, 0 to 1.
-    """
-
-    centre_m: NDArray[np.float64]
-    radius_m: float
-    strength: float
+    centre_m: NDArray[np.float64]  #: centre in world axes
+    radius_m: float  #: radius of the edge
+    strength: float  #: fraction of the light missing in the middle, 0 to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,17 +207,13 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A shadow in a camera's view.
+    """A shadow in a camera's view."""
 
-    Attributes:
-        box: First row that may show the shadow, row after the last, first column, column after the last.
-        axes: Rotation from optical to world axes.
-        numbers: Its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius
-            [m²]; strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m].
-    """
-
+    #: first row that may show the shadow, row after the last, first column, column after the last
     box: tuple[int, int, int, int]
-    axes: NDArray[np.float32]
+    axes: NDArray[np.float32]  #: rotation from optical to world axes
+    #: its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius [m²];
+    #: strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m]
     numbers: NDArray[np.float32]
 
 

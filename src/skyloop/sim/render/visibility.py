@@ -118,12 +118,7 @@ def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.i
 
 
 class DepthBuffer:
-    """Finds the nearest quad at each sample.
-
-    Attributes:
-        seen: Index in the view of the quad at each sample plus one, 0 for none; int32, shape (height, width).
-            Overwritten by the next :meth:`draw`.
-    """
+    """Finds the nearest quad at each sample."""
 
     def __init__(self, grid: Grid) -> None:
         shape = (grid.height, grid.width)
@@ -135,6 +130,8 @@ class DepthBuffer:
         self._number = np.empty(working, np.int32)
         self._mask = np.empty(working, np.uint8)
         self._scratch = np.empty(working, np.bool_)
+        #: Index in the view of the quad at each sample plus one, 0 for none; int32, shape (height, width). Overwritten
+        #: by the next :meth:`draw`.
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
