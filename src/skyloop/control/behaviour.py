@@ -174,15 +174,7 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Look up a camera in the vehicle's capabilities.
-
-    Args:
-        drone: The drone whose capabilities to read.
-        camera: The camera's name; None for the vehicle's first one.
-
-    Raises:
-        UnknownNameError: The vehicle has no camera of this name, or none at all.
-    """
+    """Look up a camera in the vehicle's capabilities by its name, or take the first; UnknownNameError without one."""
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

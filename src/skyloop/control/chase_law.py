@@ -414,9 +414,7 @@ def _response(settings: ChaseSettings) -> ResponseSettings:
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
     """Return the distance of the closest pass [m], the time to it [s] and the unit vector to the side to pass on, (2,).
 
-    Args:
-        here: Offset from the other object to the vehicle, (2,) [m].
-        moving: The vehicle's velocity relative to the other object, (2,) [m/s].
+    ``here`` is the offset from the other object to the vehicle, ``moving`` the vehicle's velocity relative to it.
     """
     square = float(moving @ moving)
     in_s = clamped(-float(here @ moving) / square, _APPROACH_HORIZON_S) if square > 0.01 else 0.0

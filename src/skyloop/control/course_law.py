@@ -96,15 +96,7 @@ class CourseLaw(VelocityLaw):
         start: Point = (0.0, 0.0),
         settings: CourseSettings | None = None,
     ) -> None:
-        """Initialise the law.
-
-        Args:
-            gates: Gates in order.
-            widths_m: Widths of the gates' openings.
-            poles: Other obstacles.
-            start: The vehicle's map position at the first feedback; its yaw at that time is the map's.
-            settings: Settings of the law; None for the defaults.
-        """
+        """Initialise the law; ``start`` is the map position, and the map's yaw that at the first feedback."""
         self.settings = s = settings or CourseSettings()
         super().__init__(
             SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),
@@ -166,15 +158,7 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the next gate; ignore it if the gate can't be there.
-
-        Args:
-            position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-            trust: Confidence in the normal, 0 to 1.
-        """
+        """Update with a sighting of the next gate, as in :meth:`GateLaw.see`; ignore it if the gate can't be there."""
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None or self._lift is None or self._number >= len(self._gates):
             return
@@ -199,13 +183,7 @@ class CourseLaw(VelocityLaw):
         self._seen += 1
 
     def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting of a pole; ignore it if no pole can be there.
-
-        Args:
-            top: Direction of the pole's top in body axes, (3,), of any length.
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-        """
+        """Update with the direction of a pole's top in body axes, (3,); ignore it if no pole can be there."""
         found = self.airframe.at_capture(at_capture, captured_ns, top)
         if found is None or self._lift is None or not self._poles:
             return

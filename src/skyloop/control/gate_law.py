@@ -103,11 +103,7 @@ class GateLaw(VelocityLaw):
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
-        """Forget the gate and search for the next one.
-
-        Args:
-            turning: Direction to search first; positive is counter-clockwise.
-        """
+        """Forget the gate and search for the next one, turning first counter-clockwise if ``turning`` is positive."""
         self.phase = GatePhase.SEARCHING
         self.forget()
         self._search.restart(turning=turning)
@@ -122,13 +118,8 @@ class GateLaw(VelocityLaw):
         """Update with a sighting.
 
         It is ignored if the vehicle's attitude or motion is unknown, or if it is far from the gate's earlier sightings.
-
-        Args:
-            position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-            trust: Confidence in the normal, 0 to 1.
+        The opening's centre, (3,) [m], and the visible side's normal are in body axes at the capture time, whose
+        attitude is that of ``at_capture``. ``trust`` is the confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
@@ -219,12 +210,8 @@ class Wall(NamedTuple):
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
     """Return the points of the shortest way, excluding the start but including the goal; None if there is no way.
 
-    The start or goal may be too close to a wall, but the way comes no closer to that wall.
-
-    Args:
-        start: East, north [m].
-        goal: East, north [m].
-        walls: Obstacles, at most a few dozen, because the effort grows with the cube of their number.
+    The start or goal may be too close to a wall, but the way comes no closer to that wall. Points are east, north [m].
+    At most a few dozen walls, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)

@@ -52,11 +52,7 @@ class ServoPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
-    """Gain and limits of :class:`ImageServoLaw`.
-
-    Raises:
-        UsageError: A number is not finite and greater than 0.
-    """
+    """Gain and limits of :class:`ImageServoLaw`."""
 
     gain: float = 0.8  #: [1/s]
     #: Fraction of the velocity error (if the velocity is known) that is added to the set-point against gusts.
@@ -82,17 +78,7 @@ class ImageServoLaw(VelocityLaw):
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
     ) -> None:
-        """Initialise the law.
-
-        Args:
-            camera: The camera, including its mounting.
-            wanted: Wanted positions of the points in the level camera, (n, 2) in the plane at z = 1.
-            depth_m: Distance between the points and the camera at the goal.
-            settings: Settings of the law; None for the defaults.
-
-        Raises:
-            UsageError: The camera's mounting is unknown.
-        """
+        """Initialise the law with the points wanted in the level camera, (n, 2) at z = 1, and their depth there."""
         mounting_rotation(camera)  # raises here rather than in flight
         s = self.settings = settings or ServoSettings()
         limits = SetpointLimits(
@@ -109,15 +95,10 @@ class ImageServoLaw(VelocityLaw):
         self._search = TurningSearch(s.search_rad_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the points from a frame.
+        """Update with the points (n, 2) from a frame as the camera saw them, in the plane at z = 1.
 
         They are ignored, as if nothing were seen, if the attitude is unknown or the vehicle is tilted so far that a
         level camera would not see them. The depth of all points is estimated from their apparent size.
-
-        Args:
-            points: The points as the camera saw them, (n, 2) in the plane at z = 1.
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
         """
         self.airframe.add(at_capture)
         roll, pitch = at_capture.roll_rad, at_capture.pitch_rad
@@ -244,11 +225,7 @@ class FlowPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
-    """Gains and limits of :class:`FlowLaw`.
-
-    Raises:
-        UsageError: A number is negative or not finite.
-    """
+    """Gains and limits of :class:`FlowLaw`."""
 
     gain: float = 2.5  #: acceleration per distance [1/s²]
     damping: float = 2.6  #: acceleration per velocity [1/s]
@@ -299,11 +276,9 @@ class FlowLaw(AirframeLaw):
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position. The first one, or the first after a second without any, becomes the position to hold.
+        """Update with a position at a capture time, (2,) [m], along yaw 0 and to its left.
 
-        Args:
-            place: The vehicle's position at the time of capture, (2,) [m], along yaw 0 and to its left.
-            captured_ns: Capture time of the frame.
+        The first one, or the first after a second without any, becomes the position to hold.
         """
         newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():

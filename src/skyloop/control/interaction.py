@@ -23,17 +23,10 @@ Array = NDArray[np.float64]
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:
-    """Return the interaction matrix (2n, 6) of points, which is their image motion per camera twist (equation 11).
+    """Return the interaction matrix (2n, 6) of points (n, 2), their image motion per camera twist (equation 11).
 
     The twist is the camera's velocity [m/s] and angular velocity [rad/s] along and about its own axes, (6,). The rows
     are x and y of each point in turn.
-
-    Args:
-        points: Shape (n, 2).
-        depths_m: Shape (n,), greater than 0.
-
-    Raises:
-        UsageError: A shape is wrong, or a number is out of its range.
     """
     points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
@@ -51,9 +44,6 @@ def camera_twist(camera: CameraInfo) -> Array:
 
     The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's position in the body matters, because a
     camera mounted ahead of the centre swings when the vehicle turns.
-
-    Raises:
-        UsageError: The camera's mounting is unknown.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -66,17 +56,7 @@ def camera_twist(camera: CameraInfo) -> Array:
 
 
 def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
-    """Return the points (n, 2) as a level camera would see them.
-
-    Args:
-        points: The points as the camera sees them, (n, 2).
-        camera: The camera, including its mounting.
-        roll: Roll of the vehicle [rad].
-        pitch: Pitch of the vehicle [rad].
-
-    Raises:
-        UsageError: A point would not be in front of a level camera.
-    """
+    """Return points (n, 2) as a level camera would see them; UsageError if one would not be in front of it."""
     mounting = mounting_rotation(camera)
     turn = mounting.T @ rotation_from_euler(roll, pitch, 0.0) @ mounting
     rays = np.column_stack([points, np.ones(len(points))]) @ turn.T
@@ -86,22 +66,10 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that brings the level camera's points to their wanted positions at an exponential rate.
+    """Compute the motion that brings the level camera's points (n, 2) to their wanted positions at an exponential rate.
 
-    The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`).
-
-    Args:
-        points: Two or more points in the level camera, (n, 2).
-        wanted: Wanted positions of the points, (n, 2).
-        depths_m: Depths of the points, shape (n,), greater than 0.
-        camera: The camera, including its mounting.
-        gain: [1/s]
-
-    Returns:
-        Forward, left, up [m/s] and yaw rate [rad/s], (4,).
-
-    Raises:
-        UsageError: The shapes differ, or there are fewer than two points.
+    The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`): forward, left, up [m/s] and yaw
+    rate [rad/s], (4,). The gain is in 1/s.
     """
     if np.shape(points) != np.shape(wanted) or len(points) < 2:
         raise UsageError(f"servo needs two or more points, and equal shapes: {np.shape(points)}, {np.shape(wanted)}")

@@ -140,12 +140,9 @@ class LandingLaw(AirframeLaw):
         self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting; ignore it if the vehicle's attitude or motion is unknown.
+        """Update with the marker's centre in body axes, (3,) [m]; ignore it if attitude or motion are unknown.
 
-        Args:
-            position: The marker's centre in body axes, (3,) [m].
-            at_capture: Feedback with the attitude at the capture time; older feedback is extrapolated by its turn rate.
-            captured_ns: Capture time of the frame.
+        The attitude is that of ``at_capture``, which is extrapolated by its turn rate if it is older than the frame.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position)
         if found is None:
@@ -341,16 +338,7 @@ class SpiralSearch:
     """
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
-        """Initialise the search.
-
-        Args:
-            lane_m: Distance between lanes.
-            speed_m_s: Maximum speed.
-            largest_m: Length of the longest leg.
-
-        Raises:
-            UsageError: A number is not finite and greater than 0.
-        """
+        """Initialise the search with the lanes' distance, the maximum speed and the longest leg's length."""
         for name, value in (("lane_m", lane_m), ("speed_m_s", speed_m_s), ("largest_m", largest_m)):
             if not 0.0 < value < math.inf:
                 raise UsageError(f"{name} is {value!r} and must be a finite number above 0")

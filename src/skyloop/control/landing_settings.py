@@ -21,9 +21,6 @@ class LandingSettings:
     """Gains, limits and heights of :class:`~skyloop.control.landing_law.LandingLaw`.
 
     Heights are those of the feet above the marker unless stated otherwise.
-
-    Raises:
-        UsageError: A number is out of its range, or two numbers contradict each other.
     """
 
     response: ResponseSettings = field(default_factory=ResponseSettings)  #: response to velocity set-points
@@ -96,14 +93,9 @@ class LandingSettings:
                 raise UsageError(f"{less} is {getattr(self, less):g} and must be below {more}, {getattr(self, more):g}")
 
     def within(self, limits: Mapping[str, Value]) -> LandingSettings:
-        """Return these settings clamped to a drone's limits, so that no set-point exceeds them.
+        """Return these settings clamped to a drone's ``limits.…``, so that no set-point exceeds them.
 
-        Args:
-            limits: ``limits.speed``, ``limits.climb``, ``limits.altitude`` and ``limits.tilt``, as in
-                ``drone.config``; a missing one sets no limit.
-
-        Raises:
-            UsageError: The drone's limits don't allow the height needed for the search.
+        A missing limit sets none. UsageError if they don't allow the height needed for the search.
         """
         climb = lowered(self.climb_m_s, limits, "limits.climb")
         return replace(

@@ -37,15 +37,9 @@ class MotionProfile:
     """Distance and speed over time, from rest to rest."""
 
     def __init__(self, stretches: Sequence[tuple[float, float]], acceleration_m_s2: float) -> None:
-        """Compute the profile.
+        """Compute the profile from the length [m] and maximum speed [m/s] of each stretch.
 
-        Args:
-            stretches: Length [m] and maximum speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches of
-                at most :data:`SHORTEST_M` take no time.
-            acceleration_m_s2: Acceleration and deceleration; greater than 0.
-
-        Raises:
-            UsageError: A stretch would never end because its speed limit is 0.
+        Speed 0 with length 0 is a stop. Stretches of at most :data:`SHORTEST_M` take no time.
         """
         self._pieces: list[_Piece] = []
         self.duration_s = 0.0  #: duration of the whole profile

@@ -77,11 +77,7 @@ class _PathFlyer(Controller):
         return None if self._law is None else self._law.target
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Send the next set-point, or hover while the position is unknown or older than ``max_age_s``.
-
-        Raises:
-            UsageError: There is no other source and the vehicle does not report its position at the start.
-        """
+        """Send the next set-point, or hover while the position is unknown or older than ``max_age_s``."""
         if self.done:
             return
         fix = fix_of(feedback) if self._source is None else self._source()

@@ -37,11 +37,7 @@ _KEPT_SETPOINTS = 64  # number of newest set-points to keep
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop. The defaults are the AR.Drone's, as far as public sources give them.
-
-    Raises:
-        UsageError: A number is out of its range.
-    """
+    """The response of a vehicle's velocity loop: by default the AR.Drone's, as far as public sources give it."""
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
     lag_s: float = 0.1  #: lag of the lean behind the demand; Engel, Sturm and Cremers, IROS 2012: 10 1/s
@@ -141,12 +137,7 @@ class VelocityResponse:
         return Predicted(end_ns, moved, velocity, self._push, self._trim)
 
     def setpoint(self, acceleration: Array, motion: Predicted) -> Array:
-        """Return the velocity set-point (2,) [m/s] that results in a wanted acceleration.
-
-        Args:
-            acceleration: Wanted acceleration, (2,) [m/s²]; at most what leaning can produce against the push.
-            motion: The motion returned by :meth:`predict`.
-        """
+        """Return the velocity set-point (2,) [m/s] for an acceleration (2,) [m/s²], as far as leaning allows."""
         by_lean = shortened(acceleration - motion.push, self.settings.most_m_s2)
         return motion.velocity + (by_lean - motion.trim) / self.settings.gain_per_s
 

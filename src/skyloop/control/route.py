@@ -159,11 +159,7 @@ class Route(_Part, frozen=True, kw_only=True):
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of a file.
-
-    Raises:
-        UsageError: The content is not a route; the message says where and why.
-    """
+    """Read a route from the content of a file; UsageError says where and why the content is not a route."""
     try:
         return checked(msgspec.json.decode(content, type=Route))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -194,11 +190,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route after checking the range of every number.
-
-    Raises:
-        UsageError: A number is out of range. Routes built by a program are checked only here.
-    """
+    """Return the route after checking the range of every number, of routes built by a program only here."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -246,11 +238,7 @@ class RouteCheck(msgspec.Struct, frozen=True):
 
 
 def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) -> Conditions:
-    """Read the conditions from a vehicle's newest feedback and its parameters.
-
-    Raises:
-        ParameterError: The no-fly zones can't be read.
-    """
+    """Read the conditions from a vehicle's newest feedback and its parameters."""
     usual = {f"{BOX}.{axis}_{end}": far for axis in "xyz" for end, far in (("low", -FAR_M), ("high", FAR_M))}
 
     def number(name: str, default: float = 0.0) -> float:
@@ -287,13 +275,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
     """Check a route against a drone's newest feedback and parameters. Waits for the proxy's answer.
 
-    Args:
-        drone: The drone; an observer's connection is enough.
-        route: The route.
-        wait_s: Time to wait for a position, for example after connecting.
-
-    Raises:
-        LinkError: The proxy does not answer.
+    An observer's connection is enough. A position, for example after connecting, is awaited for ``wait_s``.
     """
     feedback = None
     with suppress(LinkError):  # having no feedback yet becomes a finding
@@ -310,10 +292,6 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
 
     The estimate adds up the time of each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the
     duration of the actions. The battery falls in proportion to this time, as given by ``flight_time_s``.
-
-    Args:
-        route: The route.
-        conditions: The vehicle, its limits and where flying is allowed.
     """
     found: list[Finding] = []
 

@@ -92,11 +92,7 @@ Effect = Command | TakePhoto | Progress
 
 
 class RouteLaw:
-    """The course of one flight along a route. Its methods return the effects to carry out now, in order.
-
-    Args:
-        route: The route.
-    """
+    """The course of one flight along a route. Its methods return the effects to carry out now, in order."""
 
     def __init__(self, route: Route) -> None:
         self.route = route
@@ -129,11 +125,7 @@ class RouteLaw:
     # Requests ---------------------------------------------------------------------------------------------------
 
     def start(self, feedback: Feedback) -> list[Effect]:
-        """Begin at the first waypoint.
-
-        Raises:
-            UsageError: The vehicle is on the ground, or its position is unknown.
-        """
+        """Begin at the first waypoint; UsageError if the vehicle is on the ground or its position is unknown."""
         problem = lacking(feedback)
         if problem or feedback.position_m is None:
             raise UsageError(f"the route can't be flown: {problem}")
@@ -181,12 +173,7 @@ class RouteLaw:
     # The vehicle's progress ---------------------------------------------------------------------------------------
 
     def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Take the next step according to the newest feedback.
-
-        Args:
-            feedback: The newest feedback.
-            now_ns: The time, on the clock of ``feedback.captured_ns``.
-        """
+        """Take the next step according to the newest feedback; ``now_ns`` is on the clock of its capture time."""
         if not self.is_under_way:
             return []
         if not feedback.state.airborne:

@@ -52,11 +52,7 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """Prior knowledge about a kind of target.
-
-    Raises:
-        UsageError: A number is out of its range.
-    """
+    """Prior knowledge about a kind of target."""
 
     height_m: float | None = None
     height_share: float = 0.1  #: standard deviation of the height, as a fraction of the height
@@ -119,13 +115,10 @@ class TargetEstimator:
     """The filter for one target."""
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
-        """Initialise the filter.
+        """Initialise the filter; ``nominal_m`` is the initial distance if there is no cue.
 
-        Args:
-            traits: Prior knowledge about the target.
-            nominal_m: Initial distance to assume if there is no cue.
-            relative: Whether the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
-                target's motion.
+        If ``relative``, the vehicle's own velocity comes from dead reckoning, whose changing error adds to the target's
+        motion.
         """
         self.traits = traits  #: prior knowledge about the target
         self.refused = 0  #: number of consecutive boxes that did not fit
@@ -141,14 +134,7 @@ class TargetEstimator:
         self._interval_s = 0.0  # time between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
-        """Start from a first box.
-
-        Args:
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-            ground: Whether the camera's height above the ground is known.
-        """
+        """Start from a first box; ``ground`` tells whether the camera's height above the ground is known."""
         traits, height = self.traits, float(camera.position[2])
         ground = ground and traits.on_ground is not False
         guesses = [(self._nominal_m, 0.5)]  # range, relative deviation
@@ -191,12 +177,7 @@ class TargetEstimator:
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
         """Start from a first box at a guessed range, with the size that explains the box.
 
-        Args:
-            distance_m: The guessed range, with which foot and height scale.
-            share: Standard deviation of the range, as a fraction of the range.
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
+        ``share`` is the range's standard deviation as a fraction of it. Foot and height scale with the range.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -217,9 +198,6 @@ class TargetEstimator:
         """Assume, right after the start, that the target's speed is in proportion to its range.
 
         Without this, boxes that hardly move would favour the farthest of several guesses.
-
-        Args:
-            distance_m: The guessed range.
         """
         pace = _PACE_PER_S * distance_m
         self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
@@ -236,10 +214,10 @@ class TargetEstimator:
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Measure how badly a box fits.
 
-        Returns:
-            The squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own boxes,
-            and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are infinite
-            for a box that is too large above and below, because occlusion hides parts of a target but never adds any.
+        Return the squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own
+        boxes, and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are
+        infinite for a box that is too large above and below, because occlusion hides parts of a target but never adds
+        any.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
@@ -251,20 +229,9 @@ class TargetEstimator:
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box.
+        """Update with a box; return whether it was used. One over half a second older than the newest is not.
 
         An edge far from its expected position is ignored as hidden. A box in a different direction is refused.
-
-        Args:
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-
-        Returns:
-            Whether the box was used; False also for a box more than half a second older than the newest.
-
-        Raises:
-            UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -295,12 +262,6 @@ class TargetEstimator:
         """Predict the target's state. It moves for at most four seconds, while the uncertainty keeps growing.
 
         A hidden target keeps its motion from shortly before, because the occluder cuts off its last boxes.
-
-        Args:
-            at_ns: The time to predict for.
-
-        Raises:
-            UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")

@@ -174,13 +174,9 @@ class TargetFollower(AirframeLaw):
         return self.airframe.by_tilt
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target in the next frame. The first call starts with the given box.
+        """Find the target in the next frame, from the given box on; return the box, track and phase to draw.
 
-        Returns:
-            Shapes to draw: the box, its track, its expected position, and the phase.
-
-        Raises:
-            UsageError: The first box does not fit into the image, or the camera's intrinsics are unknown.
+        The first box must fit into the image, and the camera's intrinsics must be known, or this raises UsageError.
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:

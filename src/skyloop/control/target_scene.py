@@ -115,9 +115,7 @@ class _Seen(NamedTuple):
 def unlikeness(one: Floats, other: Floats) -> float:
     """Return the squared colour difference between two objects, in units of the changes caused by light and folds.
 
-    Args:
-        one: Colours of an object, (6,).
-        other: Colours of an object (6,), or of strips of a box (n, 6), of which the most similar counts.
+    The other's colours are (6,), or those of strips of a box (n, 6), of which the most similar counts.
     """
     return float(np.min(_unlike(one, other)))
 
@@ -156,15 +154,7 @@ class Scene:
     """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene.
-
-        Args:
-            relative: Whether the vehicle does not know its own velocity.
-            traits: Traits by class to use instead of :data:`~.target_estimate.TRAITS`.
-
-        Raises:
-            MissingExtraError: SciPy is not installed.
-        """
+        """Initialise an empty scene, with traits by class that replace :data:`~.target_estimate.TRAITS`."""
         self.objects: dict[int, SceneObject] = {}  #: objects by number
         self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
         #: numbers of objects not matched with detections, because their return is decided elsewhere
@@ -178,14 +168,9 @@ class Scene:
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections in the next image.
+        """Match the detections in the next image; ``ground`` tells whether the camera's height above it is known.
 
-        Args:
-            detections: Detections in one image.
-            looks: Colours of each detection: (6,), or (n, 6) for n strips from left to right.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-            ground: Whether the camera's height above the ground is known.
+        The looks of each are its colours: (6,), or (n, 6) for n strips from left to right.
         """
         self._forget(at_ns)
         seen = [

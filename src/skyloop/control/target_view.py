@@ -54,23 +54,11 @@ class Camera:
         rates_rad_s: tuple[float, float] = (0.0, 0.0),
         risen_m: float | None = None,
     ) -> Camera | None:
-        """Determine a camera's pose.
+        """Determine a camera's pose; None if the attitude is unknown.
 
-        Args:
-            mounting: The camera, including its mounting.
-            feedback: The vehicle's state at the time of capture.
-            body: Position of the vehicle, (3,) [m]; the third value is its height above the ground, if known.
-            intrinsics: Intrinsics, in pixels of the image.
-            size: Width and height of the image [px].
-            rates_rad_s: Rates of yaw and tilt for a vehicle whose images and attitude have no common clock: the faster
-                it turns, the less certain its attitude at the time of capture is.
-            risen_m: Climb by the vehicle's integrated velocity [m]; None if unknown.
-
-        Returns:
-            The camera; None if the attitude is unknown.
-
-        Raises:
-            UsageError: The camera's mounting is unknown.
+        The body's position is (3,) [m], the third value its height above the ground, if known. Where images and
+        attitude have no common clock, the rates of yaw and tilt tell how uncertain the attitude at the time of capture
+        is. ``risen_m`` is the climb by the vehicle's integrated velocity; None if unknown.
         """
         if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
             return None
@@ -118,15 +106,10 @@ class BoxView:
 
     @classmethod
     def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
-        """Compute the directions of a box.
+        """Compute the directions of a box (x, y, width, height [px]); None if it is almost straight up or down.
 
-        Args:
-            box: x, y, width, height [px].
-            camera: The camera that took the image.
-            noise: Standard deviation of an edge, as a fraction of the box's height; one pixel is added.
-
-        Returns:
-            The directions; None for a box that this camera can't show or that is almost straight above or below.
+        ``noise`` is the standard deviation of an edge as a fraction of the box's height; one pixel is added. None also
+        for a box that this camera can't show.
         """
         x, y, width, height = box
         columns, rows = camera.size
@@ -157,17 +140,7 @@ class BoxView:
 
 
 def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
-    """Return the approximate box of an upright object in the image: x, y, width, height [px].
-
-    Args:
-        camera: The camera that takes the image.
-        foot: Position of the object's foot, (3,) [m].
-        height_m: Height of the object.
-        share: Width of the box as a fraction of its height.
-
-    Returns:
-        The box; None if the camera can't show all of it.
-    """
+    """Return the approximate box [px] of an upright object, so much wider than high; None if not all is in view."""
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:
         return None

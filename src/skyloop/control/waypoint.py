@@ -101,16 +101,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Return whether the vehicle is within the acceptance radius and almost at rest.
-
-    Args:
-        goal: The waypoint.
-        feedback: The vehicle's newest feedback; without a velocity it counts as at rest.
-        settings: Acceptance radii; None for the defaults.
-
-    Raises:
-        UsageError: Position or yaw is unknown.
-    """
+    """Return whether the vehicle is within the acceptance radius and almost at rest, if its velocity is known."""
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
     velocity = feedback.velocity_m_s
@@ -152,11 +143,7 @@ PositionSource = Callable[[], Fix | None]
 
 
 def fix_of(feedback: Feedback) -> Fix | None:
-    """Return the position reported by the vehicle itself.
-
-    Returns:
-        The fix at the feedback's capture time; None if the position or yaw is unknown.
-    """
+    """Return the position reported by the vehicle itself when captured; None if position or yaw is unknown."""
     if feedback.position_m is None or feedback.yaw_rad is None:
         return None
     return Fix(

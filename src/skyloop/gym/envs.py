@@ -310,12 +310,7 @@ class Picture(_View):
 
 
 class OnBoard(_View):
-    """Renders the images of the front cameras of an arena's drones.
-
-    Args:
-        arena: The drones.
-        size_px: Edge length of the images.
-    """
+    """Renders the images of the front cameras of an arena's drones."""
 
     def __init__(self, arena: Arena, size_px: int = ONBOARD_PX) -> None:
         super().__init__(arena, size_px, size_px, _ONBOARD_FOCAL * size_px)

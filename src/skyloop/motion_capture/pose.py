@@ -86,11 +86,8 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
     """Convert from axes with y up (x right, y up, z backward, Motive's streaming default) to axes with z up.
 
-    Rotates both world and body a quarter turn about x, so that an upright body stays upright.
-
-    Args:
-        position: [m]
-        quaternion: x, y, z, w.
+    Rotates both world and body a quarter turn about x, so that an upright body stays upright. Quaternions are x, y, z,
+    w.
     """
     x, y, z = position
     qx, qy, qz, qw = quaternion
@@ -117,11 +114,7 @@ def matrix(quaternion: Quaternion) -> NDArray[np.float64]:
 
 
 def scipy_types() -> Any:
-    """Import SciPy's module of rotations and transforms.
-
-    Raises:
-        MissingExtraError: SciPy is not installed or older than 1.16.
-    """
+    """Import SciPy's module of rotations and transforms, of SciPy 1.16 or newer."""
     try:
         from scipy.spatial import transform
 
@@ -242,12 +235,7 @@ class Track:
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body that has not been seen yet.
-
-        Args:
-            body: Name of the body.
-            may_freeze: Whether the pose may stay constant, as in a simulator without noise.
-        """
+        """Initialise a body that has not been seen yet; in a simulator without noise, its pose ``may_freeze``."""
         self.body = body
         self.state = TrackState.WAITING  #: whether the body is tracked
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
@@ -258,16 +246,7 @@ class Track:
         self._last: tuple[Vector, Quaternion] | None = None
 
     def add(self, captured_ns: int, position: Vector, quaternion: Quaternion) -> BodyPose | None:
-        """Update with a new pose.
-
-        Args:
-            captured_ns: Capture time.
-            position: [m]
-            quaternion: x, y, z, w.
-
-        Returns:
-            The pose with its velocity; None if it is no newer than the last one or is frozen.
-        """
+        """Update with a new pose [m; x, y, z, w]; return it with its velocity, or None if not new or frozen."""
         if captured_ns <= self._seen_ns:
             return None
         self._seen_ns = captured_ns

@@ -78,13 +78,9 @@ class Decoder:
         self._names: dict[int, dict[int, str]] = {SENDER_DESCRIPTION: {}, TYPE_DESCRIPTION: {}}
 
     def feed(self, data: bytes) -> list[TrackerPose]:
-        """Decode the next bytes of the stream.
+        """Decode the next bytes of the stream; return the poses that they complete, in the order sent.
 
-        Returns:
-            The poses completed by these bytes, in the order sent. Everything else is skipped.
-
-        Raises:
-            DecodeError: The bytes are not VRPN, or the server ends the connection. The decoder is unusable afterwards.
+        DecodeError if the bytes are not VRPN or the server ends the connection. The decoder is unusable afterwards.
         """
         self._pending += data
         if not self._greeted:
@@ -189,15 +185,7 @@ class SensorSelection:
     """
 
     def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
-        """Initialise the selection.
-
-        Args:
-            names: Names of the bodies.
-            sensor: Sensor for bodies whose name gives none; None if the address doesn't give one.
-
-        Raises:
-            UsageError: Two names refer to the same sensor.
-        """
+        """Initialise the selection; ``sensor`` is that of bodies whose name gives none."""
         self._bodies: dict[tuple[str, int], str] = {}
         self._unnamed: set[str] = set()  # trackers whose sensor is not named
         self._reported: dict[str, tuple[int, set[int]]] = {}  # their first report and the sensors seen
@@ -214,15 +202,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest pose of each body.
-
-        Args:
-            poses: Poses in order of arrival.
-            now_ns: The time of arrival.
-
-        Returns:
-            Poses by body name; for sensors that don't belong to a body the name is ``TRACKER:SENSOR``.
-        """
+        """Return the newest of some poses in order of arrival for each body; of others by ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
@@ -270,16 +250,9 @@ class VrpnSource:
     def __init__(
         self, system: System, names: Iterable[str], take: Callable[[RawFrame], None], trouble: Callable[[str], None]
     ) -> None:
-        """Initialise without connecting.
+        """Initialise without connecting; names are ``TRACKER`` or ``TRACKER:SENSOR``.
 
-        Args:
-            system: The server's address.
-            names: Names of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
-            take: Called with each frame on the reading thread.
-            trouble: Called with a description of each problem on the reading thread.
-
-        Raises:
-            UsageError: Two names refer to the same sensor.
+        ``take`` gets each frame and ``trouble`` a description of each problem, on the reading thread.
         """
         self._system = system
         self._selection = SensorSelection(names, system.sensor)
@@ -292,12 +265,7 @@ class VrpnSource:
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Connect and wait for the first frame.
-
-        Raises:
-            LinkError: No frame arrived.
-            UsageError: A tracker has several sensors and none was named.
-        """
+        """Connect and wait for the first frame; UsageError if a tracker has several sensors and none was named."""
         self._reader.start()
         ready = self._ready.wait(timeout_s)
         if ready and not self._refused:

@@ -219,14 +219,7 @@ class Frames:
     def __init__(
         self, drone: Drone, membership: Membership, came: Callable[[], None], *, max_fps: float | None = None
     ) -> None:
-        """Prepare to subscribe.
-
-        Args:
-            drone: Source of the frames.
-            membership: The membership that has the share.
-            came: Called on the receiving thread for each frame in the share.
-            max_fps: Frame rate limit; None for no limit.
-        """
+        """Prepare to subscribe; ``came`` is called on the receiving thread for each frame in the membership's share."""
         self._drone = drone
         self._membership = membership
         self._came = came
@@ -369,24 +362,12 @@ class Tally:
         self._came.append(self._clock())
 
     def made(self, age_s: float, took_s: float) -> None:
-        """Count a published result.
-
-        Args:
-            age_s: Time since the frame's capture [s].
-            took_s: Duration of ``process`` [s].
-        """
+        """Count a published result, with the time since the frame's capture and the duration of ``process``."""
         self.results += 1
         self._made.append((self._clock(), age_s, took_s))
 
     def status(self, processor: str, camera: str, share: ProcessorShare | None, dropped: int) -> Status:
-        """Return the current statistics.
-
-        Args:
-            processor: Name of the processor.
-            camera: Name of the camera.
-            share: The worker's share of the frames; None if unknown.
-            dropped: Number of frames replaced by newer ones.
-        """
+        """Return the current statistics; ``dropped`` frames were replaced by newer ones."""
         since_ns = self._clock() - NS_PER_S
         made = [one for one in self._made.copy() if one[0] > since_ns]
         ages, took = sorted(age for _, age, _ in made), sorted(took for _, _, took in made)

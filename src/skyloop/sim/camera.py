@@ -54,11 +54,7 @@ class CameraPose:
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A camera mounted on a drone.
-
-    Raises:
-        UsageError: A value is out of its range.
-    """
+    """A camera mounted on a drone."""
 
     name: str
     width: int  #: width of the image [px]
@@ -131,22 +127,12 @@ class CameraModel:
     def pose(
         self, body_position_m: NDArray[np.float64], body_rotation: NDArray[np.float64], drone: int | None = None
     ) -> CameraPose:
-        """Return the camera's pose for a pose of its drone.
-
-        Args:
-            body_position_m: Position of the body in world axes, shape (3,).
-            body_rotation: Rotation from body to world axes, shape (3, 3).
-            drone: Number of the drone that carries the camera.
-        """
+        """Return the camera's pose for its drone's position (3,) and rotation (3, 3), world from body."""
         position = np.asarray(body_position_m, dtype=np.float64) + body_rotation @ np.asarray(self.position_m)
         return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
 
     def scaled(self, factor: float) -> CameraModel:
-        """Return the same lens with a different image size: a factor of 2 turns 320×240 into 640×480.
-
-        Raises:
-            UsageError: The factor is not a finite number greater than 0.
-        """
+        """Return the same lens with a different image size: a factor of 2 turns 320×240 into 640×480."""
         if not (math.isfinite(factor) and factor > 0.0):
             raise UsageError(f"a camera can't be scaled by {factor}; the factor must be finite and above 0")
         return replace(
@@ -160,14 +146,7 @@ class CameraModel:
         )
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project points into the image.
-
-        Args:
-            points: Points in optical axes [m], shape (n, 3), all in front of the camera (z > 0).
-
-        Returns:
-            Pixels, shape (n, 2).
-        """
+        """Project points (n, 3) in optical axes [m], all in front of the camera (z > 0), to pixels (n, 2)."""
         points = np.asarray(points, dtype=np.float64)
         bent = distort(points[:, :2] / points[:, 2:], self.distortion)
         return bent * (self.fx, self.fy) + (self.cx, self.cy)

@@ -74,12 +74,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether the exposure that is due now is worth rendering.
-
-        Args:
-            captured_ns: Time of the exposure.
-            fps: Number of frames per second in use: 0 for none, infinity for all.
-        """
+        """Return whether the exposure due now is worth rendering for so many frames per second (or infinitely many)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -142,13 +137,7 @@ class CameraPipeline(_Frames):
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
-        """Initialise without starting the thread.
-
-        Args:
-            world: The world.
-            drones: Number of drones.
-            quality: Image quality: ``fast``, ``smooth`` or ``best``.
-        """
+        """Initialise without starting the thread; ``quality`` is ``fast``, ``smooth`` or ``best``."""
         super().__init__()
         self._world = world
         self._drones = drones

@@ -265,8 +265,7 @@ class Collisions:
     def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
         """Remove the velocity into the surface and apply friction.
 
-        Returns:
-            The velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
+        Return the velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
         """
         vx, vy, vz = self._bodies.velocity[:, drone].tolist()
         nx, ny, nz = overlap.normal

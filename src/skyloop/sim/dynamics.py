@@ -349,13 +349,7 @@ class Bodies(BodyTable):
 
 
 def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
-    """Return the angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
-
-    Args:
-        rates: Rates of roll, pitch, yaw: three numbers, or three arrays.
-        sin: Sines of roll, pitch, yaw.
-        cos: Cosines of roll, pitch, yaw.
-    """
+    """Return the angular velocities about a body's axes [rad/s] from its Euler angles' rates, sines and cosines."""
     roll_rate, pitch_rate, yaw_rate = rates
     sin_roll, sin_pitch, _ = sin
     cos_roll, cos_pitch, _ = cos

@@ -55,17 +55,7 @@ class SimHost:
     """
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
-        """Load the world and place the drones in it.
-
-        Args:
-            options: Options of the world and its drones; None for the defaults.
-            drones: Number of drones.
-
-        Raises:
-            UsageError: The world has no room for that many drones.
-            UnknownNameError: There is no such world.
-            FileFormatError: The world's file is invalid.
-        """
+        """Load the world and place the drones in it."""
         self.options = options or SimOptions()  #: options of the world and its drones
         world = self.options.load_world()
         self.wind = self.options.blowing(world.wind)  #: the current wind
@@ -95,18 +85,8 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Args:
-            drone: The drone's number.
-            observer: Receives reports on the thread that steps the world.
-            screen: Receives the cameras' frames on the rendering thread.
-            models: The drone's cameras.
-
-        Returns:
-            The cameras.
-
-        Raises:
-            UsageError: There is no such drone, or it already has an observer.
-            MissingExtraError: Cameras are requested, but their renderer's libraries are not installed.
+        Reports come on the thread that steps the world, and the cameras' frames, for ``screen``, on the rendering
+        thread. A drone has one observer: for a second one this raises UsageError.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -120,11 +100,9 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer. No report is running when this returns. The last observer stops the world.
+        """Stop reporting to an observer; any other than the attached one is ignored. The last one stops the world.
 
-        Args:
-            drone: The drone's number.
-            observer: The attached observer; any other one is ignored.
+        No report is running when this returns.
         """
         with self._lock:
             entry = self._observers.get(drone)
@@ -175,12 +153,7 @@ class ReportPublisher:
     """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
-        """Initialise the publisher.
-
-        Args:
-            host: The observers' host.
-            make_pipeline: Creates the camera pipeline when the first frame is requested.
-        """
+        """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""
         self.pipeline: Exposing | None = None  #: created when the first frame is requested
         self._host = host
         self._make_pipeline = make_pipeline
@@ -188,11 +161,7 @@ class ReportPublisher:
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish the reports and exposures that are due.
-
-        Args:
-            captured_ns: Time of the simulation's state on the observers' clock.
-        """
+        """Publish the reports and exposures that are due for the state at a time on the observers' clock."""
         simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
             if occurrence.drone in observers:

@@ -175,14 +175,6 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
 
     Each vehicle hovers and, from time 0 on, gets the command as its pitch set-point. Magnitudes from
     :data:`FULL_TILT_COMMAND` on mean the tilt limit. A command of 0 is a level set-point, which differs from hovering.
-
-    Args:
-        command: The command, positive for nose down.
-        vehicles: The vehicles, at least one.
-        duration_s: Duration of the flight.
-
-    Raises:
-        UsageError: There are no vehicles, or more than fit into the world.
     """
     if not vehicles:
         raise UsageError("give at least one vehicle")

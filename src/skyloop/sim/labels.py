@@ -43,11 +43,7 @@ class TargetBox:
 
 
 class Labeller:
-    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time.
-
-    Args:
-        scene: The scene.
-    """
+    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -61,16 +57,7 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first.
-
-        Args:
-            state: The poses of all moving objects.
-            pose: The camera's pose.
-            model: The camera's model.
-
-        Raises:
-            UsageError: The state does not fit the scene, or the model's distortion can't be inverted.
-        """
+        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first."""
         raster = Raster.of(model, 1)
         posed = self._scene.posed(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone

@@ -46,12 +46,7 @@ class SimOptions:
     autopilot_folder: str | None = None
 
     def load_world(self) -> World:
-        """Load the world.
-
-        Raises:
-            UnknownNameError: There is no such world.
-            FileFormatError: The world's file is invalid.
-        """
+        """Load the world."""
         return load_world(self.world, self.seed)
 
     def blowing(self, wind: Wind) -> Wind:
@@ -102,11 +97,7 @@ class Pacer:
         self.lost_s = 0.0  # clock time skipped so far
 
     def run_due(self) -> float:
-        """Run the steps that are due, in batches.
-
-        Returns:
-            The time until the next step [s]; 0 if one is due already.
-        """
+        """Run the steps that are due, in batches; return the time until the next step [s], 0 if one is due already."""
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
             return -behind / NS_PER_S
@@ -123,14 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Convert a simulation time to the clock using the current deadlines.
-
-        Args:
-            time_s: Simulation time since this pacer's start.
-
-        Returns:
-            The clock's time when the simulation reached, or will reach, that time.
-        """
+        """Return when the simulation reached, or will reach, a time since this pacer's start, on the clock."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:
@@ -138,11 +122,7 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure.
-
-    Args:
-        now_ns: Start of the simulation.
-    """
+    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure."""
 
     def __init__(self, now_ns: int) -> None:
         self._since_ns = now_ns
@@ -150,12 +130,7 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None.
-
-        Args:
-            lost_s: Time skipped so far.
-            now_ns: The current time.
-        """
+        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None

@@ -33,9 +33,6 @@ class InstrumentParameters:
 
     ``noise`` is the standard deviation of a sample. ``bias`` is that of the error at the start of a flight, which then
     wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
-
-    Raises:
-        UsageError: A value is not finite, negative, or zero where it must be positive.
     """
 
     gyro_noise_rad_s: float = 0.002
@@ -74,9 +71,6 @@ class RotorParameters:
     A rotor turning at ω produces the thrust ``thrust_n_s2`` ω² and a torque of ``torque_m`` times that. It follows its
     command with a first-order lag. A command of 0 stops it; above 0, its speed is between ``idle_speed_rad_s`` and
     ``full_speed_rad_s`` in proportion. Both speeds are for a full battery and decrease with the voltage.
-
-    Raises:
-        UsageError: A value is not finite or out of its range, or the rotors do not surround the centre of mass.
     """
 
     #: positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`
@@ -147,11 +141,7 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameters:
-    """A vehicle's body, motors, loops, battery and sensors.
-
-    Raises:
-        UsageError: A value is not finite, negative, or zero although it is used as a divisor.
-    """
+    """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
     mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
@@ -290,11 +280,7 @@ def _scaled_flaws(parameters: VehicleParameters | InstrumentParameters, factor: 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits to which a vehicle's set-points are clamped. Defaults: AR.Drone, indoor [S].
-
-    Raises:
-        UsageError: A value is out of its range.
-    """
+    """Limits to which a vehicle's set-points are clamped. Defaults: AR.Drone, indoor [S]."""
 
     tilt_rad: float = 0.21
     climb_m_s: float = 0.7

@@ -95,11 +95,7 @@ class Constants:
 
 
 def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
-    """Return a vehicle's rotors.
-
-    Raises:
-        UsageError: The vehicle has none, because its response is modelled as a whole.
-    """
+    """Return a vehicle's rotors; UsageError if it has none, because its response is modelled as a whole."""
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
     return vehicle.rotors
@@ -192,8 +188,7 @@ def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
 def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Four, N]:
     """Change the rotors' speeds towards target speeds for a step of :data:`PLANT_STEP_S`.
 
-    Returns:
-        The rotors' speeds, and the reaction on the body as an angular acceleration about z.
+    Return the speeds, and the reaction on the body as an angular acceleration about z.
     """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
@@ -293,18 +288,10 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the rotor speeds to command in order to turn the body as wanted and lift it.
+    """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
 
-    If the rotors can't do everything, roll and pitch come first, then the thrust; yaw gets a limited share.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        rates: Rates about the body's axes.
-        speeds: Rotor speeds.
-        wanted: The target rates.
-        thrust: Thrust per mass; at 0 the rotors stop.
-        sag: Voltage of the battery as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch come first, then the thrust per mass (at 0 the rotors stop); yaw
+    gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -345,15 +332,7 @@ def electric_power(c: Constants, speeds: Four) -> N:
 
 
 def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tuple[N, N]:
-    """Return a battery's voltage and current.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        power: Power drawn from the battery [W].
-        unloaded: Voltage without a load [V].
-        voltage: Previous voltage [V].
-    """
+    """Return a battery's voltage [V] and current [A] under a power [W], from its unloaded and previous voltage."""
     current = power / do.most(voltage, 1.0)
     # A battery delivers its maximum power at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current

@@ -111,11 +111,7 @@ class RotorBodies(BodyTable):
         self.cut(drone)
 
     def command(self, drone: int, commands: Sequence[float]) -> None:
-        """Set the rotor commands of a drone flown by firmware, 0 to 1, in the order of the rotors.
-
-        Raises:
-            UsageError: They are not four finite numbers.
-        """
+        """Set the rotor commands of a drone flown by firmware, 0 to 1, in the order of the rotors."""
         if len(commands) != 4 or not all(map(math.isfinite, commands)):
             raise UsageError(f"firmware must return 4 finite rotor commands, front left first, got {commands!r}")
         constants = self._constants[drone]

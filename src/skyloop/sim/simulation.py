@@ -214,9 +214,6 @@ class Simulation:
         """Take a drone back from its firmware. Its rotors stop and the built-in autopilot takes over.
 
         A drone in the air falls in an emergency.
-
-        Raises:
-            UsageError: There is no such drone, or no firmware flies it.
         """
         with self._lock:
             if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
@@ -240,11 +237,7 @@ class Simulation:
             self._wind = WindField(wind, self.seed, self.drones, LOOP_STEPS * STEP_S)
 
     def set_charge(self, drone: int, charge: float) -> None:
-        """Set a drone's battery charge.
-
-        Raises:
-            UsageError: There is no such drone, or the charge is not between 0 and 1.
-        """
+        """Set a drone's battery charge."""
         if not 0 <= charge <= 1:
             raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
         with self._lock:
@@ -253,14 +246,7 @@ class Simulation:
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
         """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
-        Args:
-            drone: The drone's number.
-            position_m: New position of its centre in world axes.
-            yaw_rad: New heading of the drone.
-            charge: Charge of its battery, 0 to 1.
-
-        Raises:
-            UsageError: The drone is not flying, or a number is out of its range.
+        The position is that of its centre in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -325,8 +311,7 @@ class Simulation:
     def poses(self) -> tuple[Floats, Floats]:
         """Return the true poses of all bodies as new arrays, for a renderer or for motion capture.
 
-        Returns:
-            Positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
+        They are positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
         """
         with self._lock:
             return self._bodies.position.T.copy(), self._bodies.rotations()
@@ -334,9 +319,8 @@ class Simulation:
     def motions(self) -> tuple[Floats, Floats, Floats]:
         """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
-        Returns:
-            True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up
-            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
+        They are true positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up,
+        up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()
@@ -349,20 +333,12 @@ class Simulation:
             return np.array([state.airborne for state in self._autopilot.states])
 
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
-        """Return the states of the moving targets in the world's order.
-
-        Args:
-            time_s: Simulation time; None for now.
-        """
+        """Return the states of the moving targets in the world's order, now or at a simulation time."""
         time = self.time_s if time_s is None else time_s
         return tuple(track.at(time) for track in self._tracks)
 
     def light(self, time_s: float | None = None) -> float:
-        """Return the brightness of the world's light, at most 1; see :class:`~skyloop.sim.world.Light`.
-
-        Args:
-            time_s: Simulation time; None for now.
-        """
+        """Return the brightness of the world's :class:`~skyloop.sim.world.Light`, at most 1, now or at a time."""
         return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
 
     def take_occurrences(self) -> list[Occurrence]:

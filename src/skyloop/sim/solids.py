@@ -80,10 +80,9 @@ class Solids:
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
         """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
 
-        Args:
-            seconds: Time for which moving solids stay within their boxes, from their current positions.
-            radius_m: Radius of hulls, which touch a box only if their own bounding box overlaps this one. (The distance
-                between a hull and a turned box's corner is that of a square turned the same way.)
+        Moving solids stay within theirs for so many seconds, and a hull of that radius touches a box only if their
+        bounding boxes overlap. (The distance between a hull and a turned box's corner is that of a square turned the
+        same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -103,12 +102,10 @@ class Solids:
         high[:, which] = (self._centre[:, which] + around)[:, :, 0]
 
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
-        """Return which points are inside their solids, as indices into ``points`` in ascending order.
+        """Return which of the points (3, m), m > 0, are inside their solids, as indices in ascending order.
 
-        Args:
-            points: The points, shape (3, m), with m at least 1.
-            numbers: Number of the solid for each point, shape (m,).
-            sizes: Sizes from :meth:`sizes` for the same numbers and the points' hulls.
+        Each point has the number of its solid, (m,), and its sizes, from :meth:`sizes` for the same numbers and its
+        hull.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -122,13 +119,10 @@ class Solids:
         return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
-        """Return the distance to the nearest solid, wall or ceiling, (m,).
+        """Return the distance of drones at points (3, m) to the nearest solid, wall or ceiling, (m,).
 
-        It is never more than the true distance, and negative inside a solid.
-
-        Args:
-            points: Positions of the drones, (3, m).
-            hulls: Radius, radius, half height, (3, m).
+        It is never more than the true distance, and negative inside a solid. ``hulls`` are radius, radius, half height,
+        (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
         nearest: Floats = room.min(axis=0)

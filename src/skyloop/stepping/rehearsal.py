@@ -190,13 +190,7 @@ class SteppedHost(SimHost):
     """
 
     def __init__(self, options: SimOptions, clock: Clock, drones: int = 1) -> None:
-        """Initialise the world.
-
-        Args:
-            options: Options of the simulation.
-            clock: The clock that stamps the observers' samples; the caller moves it to :attr:`due_ns` before each step.
-            drones: Number of drones in the world.
-        """
+        """Initialise the world; the caller moves the clock to :attr:`due_ns` before each step."""
         super().__init__(options, drones)
         self._clock = clock
         self._manual_stepper: _ManualStepper | None = None

@@ -42,11 +42,7 @@ class SteppedReplay:
     """The proxy of a replay, and the simulated time that it shares with its only application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
-        """Start the proxy.
-
-        Args:
-            driver: The replay's driver.
-        """
+        """Start the proxy."""
         self.reach = None
         self._executor = StepExecutor("skyloop-stepping")
         try:

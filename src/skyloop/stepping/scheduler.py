@@ -44,15 +44,7 @@ class StepScheduler(Scheduler):
         source: Callable[[], StepSource | None],
         begin_ns: int,
     ) -> None:
-        """Set up simulated time.
-
-        Args:
-            clock: The clock to advance.
-            executor: The thread that runs everything except the application's code.
-            proxy: The proxy, which is ticked as time advances.
-            source: Returns the source of samples or steps; None if it does not exist yet.
-            begin_ns: Start of the recording.
-        """
+        """Set up simulated time; ``source`` returns the source of samples or steps, None before it exists."""
         super().__init__(clock)
         self._time = clock
         self._executor = executor
@@ -85,20 +77,11 @@ class StepScheduler(Scheduler):
         self._begun = True
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None, sleep: Callable[[], bool]) -> bool:
-        """Advance simulated time until ``ready()`` is true.
+        """Advance simulated time until ``ready()`` is true, evaluated after each step on the executor's thread.
 
-        If another thread is already advancing time, this one just waits in ``sleep()``.
-
-        Args:
-            ready: Evaluated after each step, on the executor's thread.
-            timeout_s: Limit in simulated time; None waits until 60 s after the recording's end.
-            sleep: Waits in real time.
-
-        Returns:
-            Whether it became ready.
-
-        Raises:
-            UsageError: Called on the executor's thread, for example by an inline callback.
+        If another thread is already advancing time, this one just waits in ``sleep()``, in real time. The limit is in
+        simulated time; None waits until 60 s after the recording's end. On the executor's thread, for example in an
+        inline callback, this raises UsageError.
         """
         if self._executor.is_current:
             raise UsageError("a callback in step with the recording can't wait for the next sample")
@@ -170,15 +153,7 @@ class StepNotifier(Notifier):
         self._scheduler = scheduler
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true; it is evaluated after each step.
-
-        Args:
-            ready: Whether the wait is over.
-            timeout_s: Limit in simulated time; None for no limit.
-
-        Returns:
-            Whether it became ready within that time.
-        """
+        """Wait until ``ready()`` is true, evaluated after each step; return whether it became so in time."""
         return ready() or self._scheduler.wait_for(
             ready, timeout_s, lambda: super(StepNotifier, self).wait_for(ready, timeout_s)
         )

@@ -33,11 +33,7 @@ class StepExecutor:
     """A thread that runs everything except the application's own code, in the order in which it was posted."""
 
     def __init__(self, name: str) -> None:
-        """Start the thread.
-
-        Args:
-            name: Name of the thread.
-        """
+        """Start the thread."""
         self._jobs: SimpleQueue[Job | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -48,19 +44,13 @@ class StepExecutor:
         return threading.current_thread() is self._thread
 
     def post(self, job: Job) -> None:
-        """Queue a job.
-
-        Args:
-            job: The job; its exceptions are logged.
-        """
+        """Queue a job, whose exceptions are logged."""
         self._jobs.put(job)
 
     def call(self, job: Job, interrupt: Job) -> None:
-        """Queue a job and wait until it has returned.
+        """Queue a job and wait until it has returned; its exceptions are raised here.
 
-        Args:
-            job: The job; its exceptions are raised here.
-            interrupt: Called on the calling thread after Ctrl-C, to make ``job`` return.
+        After Ctrl-C ``interrupt`` is called on this thread, to make the job return.
         """
         done = threading.Lock()
         done.acquire()
@@ -127,14 +117,7 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect a client.
-
-        Args:
-            handler: Called on the executor's thread.
-
-        Raises:
-            LinkError: Another client is connected, or the server was stopped.
-        """
+        """Connect a client, whose handler runs on the executor's thread; LinkError for a second or after a stop."""
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")

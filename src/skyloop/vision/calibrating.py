@@ -247,13 +247,7 @@ class Collector:
 
 
 def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Return the fraction of a grid's cells over the image that contain a corner, 0 to 1.
-
-    Args:
-        views: Views of one camera.
-        width: Width of the images [px].
-        height: Height of the images [px].
-    """
+    """Return the fraction of a grid's cells over one camera's images [px] that contain a corner, 0 to 1."""
     cells = np.zeros(GRID, dtype=bool)
     for view in views:
         column = np.clip((view.pixels[:, 0] / width * GRID[0]).astype(int), 0, GRID[0] - 1)

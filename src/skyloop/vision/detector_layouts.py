@@ -69,16 +69,9 @@ def describe(outputs: Outputs) -> str:
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Recognise a network's layout from its outputs.
+    """Recognise a network's layout from its outputs by name, from one run on any image; width and height of its input.
 
-    Args:
-        outputs: Outputs by name, from one run on any image.
-        width: Width of the network's input [px].
-        height: Height of the network's input [px].
-        classes: Number of known class names; None if there are none.
-
-    Raises:
-        FileFormatError: The outputs fit none of the families, or several.
+    FileFormatError if they fit none of the families, or several. ``classes`` is the number of known class names.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -300,11 +293,7 @@ def _decoded(rows: Floats, width: int, height: int) -> bool:
 
 
 def layout_named(name: str | Layout | None) -> Layout | None:
-    """Check a layout's name.
-
-    Raises:
-        UsageError: There is no such layout.
-    """
+    """Check a layout's name."""
     if name is None:
         return None
     try:

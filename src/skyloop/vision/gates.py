@@ -43,15 +43,7 @@ class ColourMask:
     """Selects pixels by hue at any brightness, if their saturation is high enough."""
 
     def __init__(self, colour: Rgb) -> None:
-        """Prepare the mask.
-
-        Args:
-            colour: Red, green, blue, 0 to 255.
-
-        Raises:
-            UsageError: The colour is invalid, or too grey to have a hue.
-            MissingExtraError: OpenCV is not installed.
-        """
+        """Prepare the mask; UsageError for a colour that is invalid or too grey to have a hue."""
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
             raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
         self._cv = opencv("finding a colour")

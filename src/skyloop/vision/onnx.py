@@ -63,14 +63,9 @@ def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
 
 
 def try_alone(*files: Path | str, tracker: str = "") -> None:
-    """Load and run a network in a child process within limits.
+    """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    Args:
-        files: The network's file; one or two for a tracker.
-        tracker: Name of the OpenCV tracker that the weights are for; empty to load the file in ONNX Runtime.
-
-    Raises:
-        FileFormatError: The network can't be loaded within the limits.
+    One or two files make a tracker of OpenCV, by its name; without a name the file is loaded in ONNX Runtime.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]

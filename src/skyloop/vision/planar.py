@@ -91,16 +91,10 @@ class PlanarPose:
 
     @classmethod
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
-        """Estimate the pose from the four corners.
+        """Estimate the pose from the four corners; None if no pose in front of the camera fits them.
 
-        Args:
-            cv: The module ``cv2``.
-            outline_m: The corners in the object's own axes, (4, 3).
-            rays: x/z and y/z of each corner in the image, (4, 2).
-            method: One of OpenCV's IPPE methods.
-
-        Returns:
-            The best pose; None if no pose in front of the camera fits the corners.
+        The outline is in the object's own axes, (4, 3); rays are x/z and y/z of each corner; the method is an IPPE of
+        OpenCV.
         """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
@@ -141,15 +135,7 @@ def checked(
 
 
 def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
-    """Check an image and return its pixels as a plain array that shares its memory.
-
-    Args:
-        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        colour: Whether to refuse grey images.
-
-    Raises:
-        UsageError: The array has a wrong shape or type, or is empty.
-    """
+    """Check an image as :func:`checked` does and return its pixels as a plain array that shares its memory."""
     pixels = np.asarray(image)
     grey = pixels.ndim == 2 and not colour
     if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):

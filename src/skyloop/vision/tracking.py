@@ -116,15 +116,7 @@ class Tracker(ABC):
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
-    """Check a tracker's initial box.
-
-    Args:
-        box: x, y, width, height [px].
-        shape: Shape of the image: height, width, and more.
-
-    Raises:
-        UsageError: The box is malformed or too small, or less than half of it is in the image.
-    """
+    """Return a tracker's initial box; UsageError if malformed, too small, or less than half in the image."""
     try:
         x, y, width, height = (float(part) for part in box)
     except (TypeError, ValueError):
@@ -160,14 +152,7 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box of an image. Pixels outside the image repeat its edge.
-
-    Args:
-        cv: The module ``cv2``.
-        image: (h, w, 3) or (h, w).
-        box: x, y, width, height [px], at least partly in the image.
-        size: Width and height of the result [px].
-    """
+    """Sample a box, at least partly in the image, at a size of width and height. Pixels outside repeat the edge."""
     x, y, width, height = box
     rows, columns = image.shape[:2]
     left, top = max(0, math.floor(x) - 1), max(0, math.floor(y) - 1)

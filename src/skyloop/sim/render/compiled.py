@@ -44,14 +44,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels. See :class:`Painter`.
-
-    Args:
-        raster: See :class:`Painter`.
-        model: See :class:`Painter`.
-        atlas: See :class:`Painter`.
-        functions: The kernels.
-    """
+    """Draws with kernels. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
@@ -140,10 +133,8 @@ class Compiler:
     """Compiles the kernels once for this process, on a separate thread.
 
     At its end the process waits only for the function being compiled at that moment, not for all of them, because LLVM
-    must not be torn down while it works.
-
-    Args:
-        load: Returns kernels that compile on their first call. Raises ``ImportError`` without Numba.
+    must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
+    ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:

@@ -149,10 +149,6 @@ def draw_card(pattern: MarkerPattern) -> Card:
     """Draw a marker with its margin.
 
     The black square takes up ``pattern.size_m`` of the card's ``card_size_m``, accurate to a fraction of a texel.
-
-    Raises:
-        UnknownNameError: OpenCV has no such dictionary.
-        UsageError: The dictionary has no such id.
     """
     code = getattr(cv2.aruco, pattern.dictionary, None) if pattern.dictionary.startswith("DICT_") else None
     if code is None:

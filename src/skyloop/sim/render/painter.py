@@ -41,11 +41,7 @@ class Raster:
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion.
-
-        Raises:
-            UsageError: The model's distortion can't be inverted.
-        """
+        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion."""
         return _raster(model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
 
 
@@ -85,13 +81,7 @@ def _rays(model: CameraModel) -> NDArray[np.float64]:
 
 
 class Painter(ABC):
-    """Draws through one lens. It reuses buffers, so use it from one thread at a time.
-
-    Args:
-        raster: The lens's raster.
-        model: The lens.
-        atlas: Textures of the scene.
-    """
+    """Draws through one lens. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
         self.raster = raster
@@ -102,15 +92,7 @@ class Painter(ABC):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """Draw an image.
-
-        Args:
-            quads: The scene's quads.
-            shown: Whether to draw each quad at all, (n,).
-            shadows: The shadows.
-            pose: The camera's pose.
-            picture: Output: BGR, (height, width, 3), contiguous.
-        """
+        """Draw the ``shown`` quads, (n,), and the shadows into ``picture``: BGR, (height, width, 3), contiguous."""
 
 
 class PlainPainter(Painter):

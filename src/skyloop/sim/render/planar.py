@@ -65,12 +65,7 @@ class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
     :class:`SensorEffects` adds the latter. The renderer reuses buffers, so use it from one thread at a time. Several
-    renderers can share a scene.
-
-    Args:
-        scene: The scene.
-        quality: Sampling quality.
-        compiler: Compiler for compiled drawing; None to always draw without it.
+    renderers can share a scene. Without a compiler it never draws with compiled code.
     """
 
     def __init__(
@@ -84,20 +79,7 @@ class PlanarRenderer:
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """Render an image.
-
-        Args:
-            state: The poses of all moving objects.
-            pose: The camera's pose.
-            model: The camera's model.
-            out: Array for the image; None creates one.
-
-        Returns:
-            The image, BGR, shape (model.height, model.width, 3), uint8.
-
-        Raises:
-            UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.
-        """
+        """Render an image, BGR, (model.height, model.width, 3), uint8, into ``out`` if given."""
         shape = (model.height, model.width, 3)
         if out is None:
             out = np.empty(shape, np.uint8)
@@ -199,16 +181,10 @@ class SensorEffects:
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Apply the flaws to an image in place and return it.
+        """Apply the flaws to a BGR image of the camera's size, in place, and return it.
 
-        Args:
-            picture: BGR image of the camera's size.
-            number: The frame's number.
-            body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
-                which blurs the image over the exposure; None for a drone that does not turn.
-
-        Raises:
-            UsageError: The image has a different size.
+        The drone's angular velocity about its body axes (x forward, y left, z up), (3,), blurs the image over the
+        exposure; None for a drone that does not turn. ``number`` is the frame's.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):

@@ -205,17 +205,10 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a rectangle, described as seen from the front.
+        """Add a rectangle as seen from the front: its lower left corner and its edges to the right and upwards [m].
 
-        Args:
-            lower_left: The lower left corner [m].
-            right: The edge to the right [m].
-            up: The edge upwards [m].
-            texture: The rectangle's texture.
-            two_sided: Whether it is also visible from behind.
-            priority: Priority; the quad with the highest one in a plane is visible.
-            lit: Whether it is brighter when facing the light.
-            uv: The visible part of the texture (left, top, right, bottom in texels); None for all of it.
+        The quad with the highest priority in a plane is visible; a ``lit`` one is brighter when facing the light.
+        ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -261,13 +254,10 @@ class QuadBuilder:
         sides: Texture | tuple[Texture, Texture],
         ends: Texture | None = None,
     ) -> None:
-        """Add an upright box that is visible from outside.
+        """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 
-        Args:
-            low: Its lowest corner [m].
-            high: Its highest corner [m].
-            sides: Texture of the four sides, or a pair for the sides facing along x and along y.
-            ends: Texture of the top and bottom; None for that of the sides facing along x.
+        A pair of ``sides`` is for those facing along x and along y. ``ends`` are top and bottom; None for the texture
+        along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

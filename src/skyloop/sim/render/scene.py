@@ -36,9 +36,6 @@ class Scene:
 
     Building it draws all textures (some tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
-
-    Raises:
-        UsageError: A texture, a marker dictionary or an id does not exist.
     """
 
     def __init__(self, world: World, drones: int = 1) -> None:
@@ -93,11 +90,7 @@ class Scene:
         ]
 
     def posed(self, state: SceneState) -> Posed:
-        """Place all moving parts according to a state.
-
-        Raises:
-            UsageError: The state has a different number of drones or targets.
-        """
+        """Place all moving parts according to a state."""
         shape = np.shape(state.drone_positions_m), np.shape(state.drone_rotations)
         if shape != ((self.drones, 3), (self.drones, 3, 3)):
             raise UsageError(
@@ -164,12 +157,7 @@ _LEAN = np.array([-0.16, 0.20])
 
 
 def static_quads(world: World, atlas: AtlasBuilder) -> Quads:
-    """Return all fixed parts of a world.
-
-    Args:
-        world: The world.
-        atlas: Receives the textures.
-    """
+    """Return all fixed parts of a world."""
     parts = [_shell(world, atlas, world.solids())]
     parts += [_box(box, atlas) for box in world.solids()]
     for panel in world.panels:

@@ -77,15 +77,9 @@ class Shader:
         colours: NDArray[np.uint8],
         inverse_depth: NDArray[np.float32],
     ) -> None:
-        """Write the samples' colours and inverse depths.
+        """Write the samples' colours, BGRA, (n, 4), and inverse depths [1/m], (n,), to the last two arguments.
 
-        Args:
-            table: The table from :func:`sampling_table`.
-            seen: The table's column for each sample, (n,).
-            ray_x: x of the ray (x, y, 1), (n,).
-            ray_y: y of the ray, (n,).
-            colours: Output: colours, BGRA, shape (n, 4).
-            inverse_depth: Output: inverse depths [1/m], (n,).
+        ``seen`` is each sample's column in the table from :func:`sampling_table`, (n,), and its ray is (x, y, 1).
         """
         for start in range(0, len(seen), CHUNK):
             part = slice(start, min(start + CHUNK, len(seen)))
@@ -233,14 +227,7 @@ def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
 
 
 def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth: NDArray[np.float32]) -> None:
-    """Darken the pixels of an image that show the area of a shadow.
-
-    Args:
-        picture: BGR image, (height, width, 3), changed in place.
-        shadow: The shadow.
-        rays: The lens's rays.
-        inverse_depth: Inverse depth of each pixel [1/m], (height, width).
-    """
+    """Darken the pixels of a BGR image that show the area of a shadow, by the inverse depth of each pixel [1/m]."""
     top, bottom, left, right = shadow.box
     part = slice(top, bottom), slice(left, right)
     x, y, depth = rays.x[part], rays.y[part], 1.0 / inverse_depth[part]
@@ -259,9 +246,7 @@ def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth
 def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float, float]]:
     """Return x/z and y/z of the corners of the part of a square that is more than 1 cm ahead, in optical axes.
 
-    Args:
-        centre: The square's centre [m].
-        sides: Vectors from the centre to the middles of two sides [m].
+    ``sides`` are the vectors from its centre to the middles of two sides [m].
     """
     (ax, ay, az), (bx, by, bz) = sides
     signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

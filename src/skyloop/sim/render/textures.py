@@ -46,11 +46,7 @@ class Sheet:
 
 
 def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed: int = 0) -> NDArray[np.uint8]:
-    """Draw a surface of a size in metres at a number of texels per metre, BGR, as seen upright.
-
-    Raises:
-        UnknownNameError: No texture has this name.
-    """
+    """Draw a surface of a size in metres at a number of texels per metre, BGR, as seen upright."""
     if name not in _SURFACES and name not in PICTURES:
         raise UnknownNameError("texture", name, [*_SURFACES, *PICTURES])
     height, width = max(4, round(height_m * per_m)), max(4, round(width_m * per_m))
