@@ -27,8 +27,7 @@ from skyloop.control import (
 )
 from skyloop.control.course_law import CourseSettings
 from skyloop.control.gate_law import GatePhase, GateSettings
-from skyloop.control.landing_law import LandingPhase
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingPhase, LandingSettings
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from skyloop.control.interaction import camera_twist, interaction_matrix, levelled, servo
+from skyloop.control.image_servo import camera_twist, interaction_matrix, levelled, servo
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo
 from skyloop.messages.geometry import rotation_from_euler

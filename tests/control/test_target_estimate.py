@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from skyloop.clock import nanoseconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, TargetState, Traits
 from skyloop.errors import UsageError
 from tests.support.target_world import PERIOD_S, PERSON, Path, box_of, camera_at, view_of, walk
 

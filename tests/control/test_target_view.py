@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from skyloop.control.target_view import BoxView, Camera, predicted_box
+from skyloop.control.target_estimate import BoxView, Camera, predicted_box
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback
 from skyloop.messages.geometry import wrap_angle

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Literal
 from skyloop.clock import seconds
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.follow import FollowMarker, FollowSettings, Mode
-from skyloop.control.landing_law import LandingLaw, LandingPhase
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
 from skyloop.control.limiting import clamped
 from skyloop.control.path import Circle
-from skyloop.control.path_following import FollowPath
-from skyloop.control.path_law import AlongPath, LookAt
+from skyloop.control.path_law import AlongPath, FollowPath, LookAt
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import FlightState, Polyline, Severity, Text

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
-from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
 from skyloop.vision import LongTermTracker
 from skyloop.vision.appearance import colours

@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from skyloop.clock import seconds
 from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
-from skyloop.control.chase_law import ChaseLaw
-from skyloop.control.chase_settings import LOSSES, ChaseSettings, FollowMode, TargetPhase
-from skyloop.control.target_estimate import TargetEstimator, Traits
+from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.target_estimate import Camera, TargetEstimator, Traits, predicted_box
 from skyloop.control.target_finder import Sighting, TargetFinder
-from skyloop.control.target_view import Camera, predicted_box
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
 from skyloop.messages.relayed import Colour, Shape

@@ -22,8 +22,16 @@ import numpy as np
 
 from skyloop.clock import seconds
 from skyloop.control.limiting import within
-from skyloop.control.target_estimate import LEAST_SLOPE, SURE_OF_SIZE, UNKNOWN, TargetEstimator, TargetState, Traits
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.target_estimate import (
+    LEAST_SLOPE,
+    SURE_OF_SIZE,
+    UNKNOWN,
+    BoxView,
+    Camera,
+    TargetEstimator,
+    TargetState,
+    Traits,
+)
 
 _RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # initial ranges of the hypotheses, up to 29 m
 _SHARE: Final = 0.3  # standard deviation of each range, as a fraction of the range

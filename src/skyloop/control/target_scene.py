@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, Traits
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, Traits
 from skyloop.estimation import assignment
 from skyloop.vision.object_tracks import Detection
 

@@ -33,8 +33,7 @@ from skyloop.sim.camera import CameraModel
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import TICK_S, Report, ReportPublisher, SimHost, Stepper
 from skyloop.sim.options import SimOptions
-from skyloop.stepping.scheduler import StepScheduler
-from skyloop.stepping.transport import StepExecutor, SteppedServer
+from skyloop.stepping.transport import StepExecutor, SteppedServer, StepScheduler
 from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.options import options_of
 

@@ -14,8 +14,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.uri import parse_uri
 from skyloop.proxy.proxy import Proxy
-from skyloop.stepping.scheduler import StepScheduler
-from skyloop.stepping.transport import StepExecutor, SteppedServer
+from skyloop.stepping.transport import StepExecutor, SteppedServer, StepScheduler
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 

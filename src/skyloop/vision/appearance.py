@@ -18,10 +18,10 @@ from skyloop.errors import UsageError
 from skyloop.messages.geometry import within
 from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import pixels_of
-from skyloop.vision.trackers import CorrelationTracker
 from skyloop.vision.tracking import (
     LEAST_PX,
     Box,
+    CorrelationTracker,
     Floats,
     Image,
     Tracker,
