@@ -41,7 +41,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.sim.camera import BOTTOM_CAMERA
-from skyloop.sim.geometry import geometry_of
+from skyloop.sim.world import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
 from tests.support.scripted_proxy import WAIT_S, flown, scripted

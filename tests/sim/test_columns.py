@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, Hover, Land, Takeoff, Velocity
 from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Wind, columns, load_world
-from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, few
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, Fields, few
 from skyloop.sim.reports import Occurrence, VehicleFeedback
 from skyloop.sim.vehicles import AR_DRONE
 from tests.sim.helpers import HALL

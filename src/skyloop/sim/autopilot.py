@@ -26,12 +26,11 @@ from skyloop.messages import (
 )
 from skyloop.messages.geometry import clamped
 from skyloop.sim.collisions import Contacts
-from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.control_loops import ControlLoops, Sensors
 from skyloop.sim.dynamics import column
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.rotors import RotorBodies
-from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
 
 

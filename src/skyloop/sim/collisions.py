@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyloop.messages.geometry import clamped
-from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
-from skyloop.sim.dynamics import STEP_S, BodyTable, column
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, STEP_S, BodyTable, N, Operations, column, few
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats

@@ -17,8 +17,8 @@ from skyloop.errors import UsageError
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
-from skyloop.sim.render.base import Image
 from skyloop.sim.render.painter import Raster
+from skyloop.sim.render.quads import Image
 from skyloop.sim.render.visibility import DepthBuffer, visible_quads
 from skyloop.sim.solids import Solids
 from skyloop.sim.streams import Purpose, stream

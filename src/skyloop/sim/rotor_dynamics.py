@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import N, Operations
+from skyloop.sim.dynamics import N, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, VehicleParameters
 
 PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, columns
-from skyloop.sim.dynamics import STEP_S, BodyTable, body_rates, column
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, STEP_S, BodyTable, Fields, body_rates, column, columns
 from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.rotor_dynamics import (

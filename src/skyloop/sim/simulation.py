@@ -18,13 +18,12 @@ from skyloop.messages import Action, AnyAction, FlightState
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.sim.autopilot import Autopilot, Batteries
 from skyloop.sim.collisions import Collisions
-from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.control_loops import ControlLoops, Sensors
 from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable, WindField
 from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
 from skyloop.sim.rotors import RotorBodies
-from skyloop.sim.sensors import Sensors
 from skyloop.sim.solids import Solids, place
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack

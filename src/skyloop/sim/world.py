@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.messages.parameter import Card, Opening, Solid, Start, WorldGeometry
 from skyloop.sim.streams import Purpose, stream
 
 Vec2 = tuple[float, float]
@@ -429,3 +430,36 @@ class World:
     def solids(self) -> tuple[Box, ...]:
         """Return every fixed solid: the boxes, and the gates' bars and legs."""
         return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())
+
+
+def geometry_of(world: World) -> WorldGeometry:
+    """Return the fixed geometry of a world, without textures and moving objects."""
+    x, y, z = world.room.size_m
+    return WorldGeometry(
+        name=world.name[:64],
+        low=(-x / 2, -y / 2, 0.0),
+        high=(x / 2, y / 2, z),
+        enclosed=world.room.enclosed,
+        solids=tuple(
+            Solid(b.name, _rounded(b.position_m), _rounded(b.size_m), round(b.yaw_rad, 4)) for b in world.boxes
+        ),
+        gates=tuple(
+            Opening(g.name, _rounded(g.position_m), g.inner_size_m, round(g.yaw_rad, 4), g.frame_m) for g in world.gates
+        ),
+        markers=tuple(
+            Card(
+                m.name,
+                _rounded(m.pose.position_m),
+                m.pattern.size_m,
+                round(m.pose.yaw_rad, 4),
+                round(m.pose.elevation_rad, 4),
+            )
+            for m in world.markers
+        ),
+        starts=tuple(Start(s.name, _rounded(s.position_m), round(s.yaw_rad, 4)) for s in world.spawns),
+    )
+
+
+def _rounded(place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Round to millimetres, to keep the text short."""
+    return round(place[0], 3), round(place[1], 3), round(place[2], 3)

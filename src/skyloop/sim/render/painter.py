@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraModel, CameraPose, Distortion
-from skyloop.sim.render.base import Image, cv2
-from skyloop.sim.render.quads import Atlas, Quads
+from skyloop.sim.render.quads import Atlas, Image, Quads, cv2
 from skyloop.sim.render.shading import Placed, Rays, Shader, darken, sampling_table
 from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
 

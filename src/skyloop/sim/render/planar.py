@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.sim.camera import CameraModel, CameraPose
-from skyloop.sim.render.base import Image, SceneState, cv2
 from skyloop.sim.render.compiled import COMPILER, CompiledPainter, Compiler
 from skyloop.sim.render.painter import Painter, PlainPainter, Raster
+from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 

@@ -1,6 +1,6 @@
-"""Textured convex quadrilaterals as arrays, the shapes made from them, and one image with all their textures.
+"""The renderer's input and output, and textured convex quadrilaterals as arrays, with shapes and their textures.
 
-Each texture has its smaller versions (mip levels) next to it.
+All textures are in one image, each with its smaller versions (mip levels) next to it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,33 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyloop.sim.render.base import cv2
+from skyloop.errors import MissingExtraError
+from skyloop.sim.world import TargetState
+
+try:
+    import cv2
+except ImportError as error:
+    raise MissingExtraError("the simulator", "sim", cause=str(error)) from error
+
+__all__ = ["cv2"]  # handed on; all else is this module's own
+
+Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneState:
+    """The poses of all moving objects at a point in time.
+
+    The renderer may cache results for as long as it receives the same state object, so don't write to a state's arrays
+    afterwards.
+    """
+
+    drone_positions_m: NDArray[np.float64]  #: positions of the bodies' origins in world axes, shape (n, 3)
+    drone_rotations: NDArray[np.float64]  #: world from body, shape (n, 3, 3)
+    targets: tuple[TargetState, ...] = ()  #: one state for each target in the world, in the world's order
+    #: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
+    light: float = 1.0
+
 
 LEVELS = 7
 BORDER = 4  # pixels repeated around each level, so that interpolation at the rim stays within the level

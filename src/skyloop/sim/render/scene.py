@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.sim.render import models
-from skyloop.sim.render.base import SceneState, cv2
-from skyloop.sim.render.figures import figure
-from skyloop.sim.render.models import card
-from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads, Texture, concatenate, move_each
+from skyloop.sim.render.models import card, figure
+from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads, SceneState, Texture, concatenate, cv2, move_each
 from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import BoardTarget, Box, FigureTarget, PlatformTarget, Room, World

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraPose
-from skyloop.sim.render.base import cv2
-from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads
+from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
 from skyloop.sim.render.visibility import View, dot, turned
 
 CHUNK = 16384  # samples per batch: few enough for the working arrays to stay in the cache

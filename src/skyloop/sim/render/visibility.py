@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraPose
-from skyloop.sim.render.base import cv2
-from skyloop.sim.render.quads import Floats, Quads
+from skyloop.sim.render.quads import Floats, Quads, cv2
 
 # How much closer a picture counts than the wall behind it, per step of priority, as a fraction of the distance.
 PRIORITY_SHARE = 1e-3
