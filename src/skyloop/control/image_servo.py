@@ -14,7 +14,7 @@ Over the ground, optical flow measures the drift, and attitude set-points counte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimits, clamped, require_positive, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
@@ -130,10 +130,7 @@ class ServoSettings:
     search_rad_s: float = 0.7
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        require_positive(**asdict(self))
 
 
 class ImageServoLaw(VelocityLaw):
@@ -234,8 +231,7 @@ class ImageServo(Behaviour):
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
-        if not 0.0 < distance_m < math.inf:
-            raise UsageError(f"distance_m is {distance_m!r} and must be a finite number above 0")
+        require_positive(distance_m=distance_m)
         info = camera_info(drone, camera)
         if mounting_rotation(info)[0, 2] < 0.5:
             raise UsageError(f"camera {info.name!r} does not look forward")
@@ -301,10 +297,7 @@ class FlowSettings:
     fresh_s: float = 0.3  #: time to continue without sight of the ground
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        require_positive(self.__dataclass_fields__, **asdict(self))
 
 
 @dataclass(slots=True)

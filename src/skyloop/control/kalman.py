@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import within
+from skyloop.control.limiting import require_positive, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
@@ -91,9 +91,7 @@ class _Filter(ABC, Generic[_E]):
     """The common base class of both filters."""
 
     def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
-        for name, value in finite.items():
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        require_positive(finite, **finite)
         if not gate > 0.0:
             raise UsageError(f"gate is {gate!r} and must be above 0")
         self._n, self._gate = dimensions, gate
@@ -292,8 +290,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
             turn_wander_rad_s=turn_wander_rad_s,
             extra_m_s2=extra_m_s2,
         )
-        if not 0.0 < extra_s < math.inf:
-            raise UsageError(f"extra_s is {extra_s!r} and must be a finite number above 0")
+        require_positive(extra_s=extra_s)
         self._intensity = intensity_m2_s3
         first = [0.0, 0.0, speed_m_s, speed_m_s, turn_rad_s, extra_m_s2, extra_m_s2]
         self._first = np.diag(np.square(first))

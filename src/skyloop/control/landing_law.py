@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Motion, Part
 from skyloop.control.kalman import TurnEstimate, TurningTargetFilter
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, lowered, shortened, within
+from skyloop.control.limiting import (
+    SetpointLimiter,
+    SetpointLimits,
+    clamped,
+    lowered,
+    require_positive,
+    shortened,
+    within,
+)
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Value, Velocity
@@ -95,17 +103,11 @@ class LandingSettings:
     give_up_s: float = math.inf  #: time after the start at which to give up
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if name == "response":
-                continue
-            if name == "attempts":
-                if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                    raise UsageError(f"attempts is {value!r} and must be a whole number of at least 1")
-            elif name in _MAY_BE_0 and value == 0.0:
-                continue
-            elif not (0.0 < value < math.inf or (name in _MAY_BE_INFINITE and value == math.inf)):
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        if isinstance(self.attempts, bool) or not isinstance(self.attempts, int) or self.attempts < 1:
+            raise UsageError(f"attempts is {self.attempts!r} and must be a whole number of at least 1")
+        numbers = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "response"}
+        infinite = {name for name in _MAY_BE_INFINITE if numbers[name] == math.inf}
+        require_positive(_MAY_BE_0, **{name: value for name, value in numbers.items() if name not in infinite})
         for less, more in (("touch_m", "nearly_m"), ("nearly_m", "commit_m"), ("commit_m", "search_height_m")):
             if getattr(self, less) >= getattr(self, more):
                 raise UsageError(f"{less} is {getattr(self, less):g} and must be below {more}, {getattr(self, more):g}")
@@ -436,9 +438,7 @@ class SpiralSearch:
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
         """Initialise the search with the lanes' distance, the maximum speed and the longest leg's length."""
-        for name, value in (("lane_m", lane_m), ("speed_m_s", speed_m_s), ("largest_m", largest_m)):
-            if not 0.0 < value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        require_positive(lane_m=lane_m, speed_m_s=speed_m_s, largest_m=largest_m)
         self._lane, self._speed = lane_m, speed_m_s
         self._legs = max(1, int(largest_m / lane_m)) * 2
         self._leg = 0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.controller import Controller
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, lowered, within
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, lowered, require_positive, within
 from skyloop.control.path import Path, Polyline
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.control.waypoint import Fix, PositionSource, Waypoint, fix_of, lacking
@@ -118,11 +118,8 @@ class PathSettings:
     near_rad: float = 0.15  #: maximum acceptable yaw error
 
     def __post_init__(self) -> None:
-        for name in ("velocity_gain", "yaw_gain", "lead_s", "leash_m", "near_m", "near_rad"):
-            value = getattr(self, name)
-            allowed = "a finite number, 0 or more" if name in _MAY_BE_ZERO else "a finite number above 0"
-            if not 0.0 <= value < math.inf or (value == 0.0 and name not in _MAY_BE_ZERO):
-                raise UsageError(f"{name} is {value!r} and must be {allowed}")
+        numbers = (*_MAY_BE_ZERO, "leash_m", "near_m", "near_rad")
+        require_positive(_MAY_BE_ZERO, **{name: getattr(self, name) for name in numbers})
         if self.gains.d > 0.0:
             raise UsageError(f"gains.d is {self.gains.d!r} and must be 0: velocity_gain damps")
 

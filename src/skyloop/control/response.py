@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
-from skyloop.control.limiting import GRAVITY_M_S2, shortened, within
+from skyloop.control.limiting import GRAVITY_M_S2, require_positive, shortened, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 from skyloop.messages import Feedback
@@ -48,11 +48,7 @@ class ResponseSettings:
     trim_s: float = 0.3  #: time constant for learning the trim
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            lowest_is_fine = name == "delay_s" and value == 0.0
-            if not (0.0 < value < math.inf or lowest_is_fine):
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        require_positive({"delay_s"}, **asdict(self))
         if not self.tilt_rad < math.pi / 2:
             raise UsageError(f"tilt_rad is {self.tilt_rad!r} and must be below a quarter turn")
 

@@ -106,12 +106,11 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     rotors = rotors_of(vehicle)
     ix, iy, iz = rotors.inertia_kg_m2
     mass, k = vehicle.mass_kg, rotors.thrust_n_s2
-    (x1, y1), (x2, y2), (x3, y3), (x4, y4) = rotors.places_m
+    xs, ys = zip(*rotors.places_m, strict=True)
     # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
-    rows = [[1.0] * 4, [y1, y2, y3, y4], [-x1, -x2, -x3, -x4], [rotors.torque_m * sign for sign in YAW_SIGNS]]
-    share = np.linalg.inv(np.array(rows))
-    roll, pitch, yaw = (share[:, 1] * ix).tolist(), (share[:, 2] * iy).tolist(), (share[:, 3] * iz).tolist()
-    collective = mass / 4
+    rows = [[1.0] * 4, ys, [-x for x in xs], [rotors.torque_m * sign for sign in YAW_SIGNS]]
+    _, roll, pitch, yaw = (np.linalg.inv(np.array(rows)) * (1.0, ix, iy, iz)).T.tolist()
+    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # of the rotors
     return Constants(
         thrust=k,
         idle_speed=rotors.idle_speed_rad_s,
@@ -128,14 +127,6 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         rotor_offset=vehicle.rotor_height_m - vehicle.half_height_m,
         rotor_height=vehicle.rotor_height_m,
         ground_effect=vehicle.ground_effect**0.5 * vehicle.rotor_radius_m / 4,
-        x1=x1,
-        x2=x2,
-        x3=x3,
-        x4=x4,
-        y1=y1,
-        y2=y2,
-        y3=y3,
-        y4=y4,
         roll_per_torque=1.0 / ix,
         pitch_per_torque=1.0 / iy,
         yaw_per_thrust=rotors.torque_m / iz,
@@ -149,23 +140,12 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         rate_gain=2 * vehicle.attitude_damping * vehicle.attitude_frequency_rad_s,
         yaw_gain=1.0 / vehicle.yaw_time_constant_s,
         most_turning=vehicle.most_angular_acceleration_rad_s2,
-        collective=collective,
-        roll1=roll[0],
-        roll2=roll[1],
-        roll3=roll[2],
-        roll4=roll[3],
-        pitch1=pitch[0],
-        pitch2=pitch[1],
-        pitch3=pitch[2],
-        pitch4=pitch[3],
-        yaw1=yaw[0],
-        yaw2=yaw[1],
-        yaw3=yaw[2],
-        yaw4=yaw[3],
+        collective=mass / 4,
         shaft_power=rotors.torque_m * k / rotors.efficiency,
         electronics_power=vehicle.electronics_power_w,
         full_voltage=vehicle.battery_full_v,
         resistance=vehicle.battery_resistance_ohm,
+        **{f"{name}{number}": value for name, values in each.items() for number, value in enumerate(values, 1)},
     )
 
 
