@@ -257,7 +257,16 @@ class MotionCapture:
         Raises:
             UnknownNameError: ``bodies`` has no such name.
         """
-        return fixes(self, drone)
+        name = drone.name
+        self._track(name)  # raises here for an unknown name
+
+        def newest() -> Fix | None:
+            pose = self.pose(name)
+            if pose is None:
+                return None
+            return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position_m, pose.yaw_rad, pose.velocity_m_s)
+
+        return newest
 
     # Calibration -----------------------------------------------------------------------------------------------
 
@@ -408,21 +417,3 @@ class Linked:
             lost = event.state is TrackState.LOST
             severity = Severity.WARNING if lost else Severity.INFO
             self._drone.log.text(event.text, name=MOCAP, severity=severity)
-
-
-def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
-    """Return a position source for controllers, with a drone's newest pose and its time on the proxy's clock.
-
-    Raises:
-        UnknownNameError: The capture has no body with the drone's name.
-    """
-    name = drone.name
-    capture.state(name)  # raises here for an unknown name
-
-    def newest() -> Fix | None:
-        pose = capture.pose(name)
-        if pose is None:
-            return None
-        return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position_m, pose.yaw_rad, pose.velocity_m_s)
-
-    return newest

@@ -76,14 +76,11 @@ class CameraModel:
     def __post_init__(self) -> None:
         if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
             raise UsageError(f"camera {self.name!r}: {self.width}x{self.height} pixels; sides must be 1 to 8192")
-        positive = {"fps": self.fps, "fx": self.fx, "fy": self.fy, "exposure_gain": self.exposure_gain}
-        for what, value in positive.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and above 0")
-        not_negative = {"latency_s": self.latency_s, "noise_sigma": self.noise_sigma, "exposure_s": self.exposure_s}
-        for what, value in not_negative.items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and not negative")
+        for what in ("fps", "fx", "fy", "exposure_gain", "latency_s", "noise_sigma", "exposure_s"):
+            value, may_be_zero = getattr(self, what), what in ("latency_s", "noise_sigma", "exposure_s")
+            if not (0.0 < value < math.inf or (may_be_zero and value == 0.0)):
+                allowed = "not negative" if may_be_zero else "above 0"
+                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and {allowed}")
         if not 0.0 <= self.vignetting <= 1.0:
             raise UsageError(f"camera {self.name!r}: vignetting is {self.vignetting}; it must be from 0 to 1")
         if not np.isfinite([self.cx, self.cy, *self.distortion, *self.position_m]).all():
@@ -104,11 +101,11 @@ class CameraModel:
 
     @property
     def distorted(self) -> bool:
-        """Return the intrinsics, as given with each frame."""
+        """Whether the lens bends straight lines."""
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """Return the camera's description as drivers report it before the first frame."""
+        """Return the intrinsics, as given with each frame."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 

@@ -29,9 +29,8 @@ from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
-WORTH_COMPILING: Final = (
-    30  #: images that a renderer draws before; for fewer, compilation would take longer than it saves
-)
+#: Number of images that a renderer draws before; for fewer, compilation would take longer than it saves.
+WORTH_COMPILING: Final = 30
 
 
 class Quality(Enum):
