@@ -198,31 +198,20 @@ class ChaseLaw:
 
     def step(
         self,
-        now_ns: int,
-        motion: Motion,
-        altitude_m: float | None,
-        target: TargetEstimator | None,
-        seen_ns: int | None,
-        others: Sequence[TargetState] = (),
+        now_ns: int,  # the current time on the proxy's clock
+        motion: Motion,  # the vehicle's newest motion; from dead reckoning if ``relative``
+        altitude_m: float | None,  # height above the ground; None leaves the height unchanged
+        target: TargetEstimator | None,  # the target's filter; None before the first sighting
+        seen_ns: int | None,  # time of the target's last certain or possible sighting; None if there was none
+        others: Sequence[TargetState] = (),  # recently seen objects to keep clear of
         *,
-        candidate: TargetState | None = None,
+        candidate: TargetState | None = None,  # a possible match for the lost target; the vehicle turns towards it
+        # the vehicle reports no velocity (see :class:`.airframe.TiltVelocity`), so the set-point is an attitude
         relative: bool = False,
+        # the vehicle's position in world axes [m]; None if unknown: the leash then integrates velocity
         position: Vector | None = None,
     ) -> Velocity | Attitude:
-        """Compute the set-point for now.
-
-        Args:
-            now_ns: The current time on the proxy's clock.
-            motion: The vehicle's newest motion; from dead reckoning if ``relative``.
-            altitude_m: Height above the ground; None leaves the height unchanged.
-            target: The target's filter; None before the first sighting.
-            seen_ns: Time of the target's last certain or possible sighting; None if there was none.
-            others: Recently seen objects to keep clear of.
-            candidate: A possible match for the lost target; the vehicle turns towards it.
-            relative: The vehicle reports no velocity (see :class:`.airframe.TiltVelocity`), so the set-point is an
-                attitude.
-            position: The vehicle's position in world axes [m]; None if unknown: the leash then integrates velocity.
-        """
+        """Compute the set-point for now."""
         s = self.settings
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns

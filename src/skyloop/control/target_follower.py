@@ -68,27 +68,18 @@ class TargetFollower(AirframeLaw):
 
     def __init__(
         self,
-        camera: CameraInfo,
+        camera: CameraInfo,  # the camera, including its mounting; it must look forward
         *,
-        box: Box | None = None,
+        box: Box | None = None,  # box of the target in the first frame given to :meth:`look`: x, y, width, height [px]
+        # class of which to follow the largest object if there is no box; needs detections
         class_name: str | None = None,
-        mode: FollowMode = FollowMode.FOLLOW,
-        detector: ObjectDetector | None = None,
-        detects: bool = False,
-        traits: Traits | None = None,
-        settings: ChaseSettings | None = None,
+        mode: FollowMode = FollowMode.FOLLOW,  # how to follow
+        detector: ObjectDetector | None = None,  # detector to run on every frame on the thread that calls :meth:`look`
+        detects: bool = False,  # whether detections arrive from elsewhere through :meth:`detected`
+        traits: Traits | None = None,  # prior knowledge about the target; None for that of its class
+        settings: ChaseSettings | None = None,  # settings of the law; None for the defaults
     ) -> None:
         """Initialise the follower.
-
-        Args:
-            camera: The camera, including its mounting; it must look forward.
-            box: Box of the target in the first frame given to :meth:`look`: x, y, width, height [px].
-            class_name: Class of which to follow the largest object if there is no box; needs detections.
-            mode: How to follow.
-            detector: Detector to run on every frame on the thread that calls :meth:`look`.
-            detects: Whether detections arrive from elsewhere through :meth:`detected`.
-            traits: Prior knowledge about the target; None for that of its class.
-            settings: Settings of the law; None for the defaults.
 
         Raises:
             UsageError: There is neither a box nor a class, a class has no detections, the camera does not look forward,

@@ -92,28 +92,20 @@ def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: Camer
 
 
 def pictures(
-    world: World,
-    seed: int,
-    count: int,
-    size: tuple[int, int] = (320, 240),
-    focal_share: float = 0.75,
+    world: World,  # the world
+    seed: int,  # seed of the positions and times
+    count: int,  # number of images
+    size: tuple[int, int] = (320, 240),  # width and height of the images [px]
+    focal_share: float = 0.75,  # focal length as a fraction of the width
     *,
+    # camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out
     camera: CameraModel | None = None,
-    tilt_rad: float | None = None,
+    tilt_rad: float | None = None,  # maximum random pitch and roll, in either direction
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
     """Yield labelled images of a world from random positions at random times.
 
     Cameras are 0.7 to 3 m high and outside of solids; two thirds of them look roughly at a target. Pitch is at most 15°
     and roll is small, unless ``tilt_rad`` sets both.
-
-    Args:
-        world: The world.
-        seed: Seed of the positions and times.
-        count: Number of images.
-        size: Width and height of the images [px].
-        focal_share: Focal length as a fraction of the width.
-        camera: Camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out.
-        tilt_rad: Maximum random pitch and roll, in either direction.
 
     Raises:
         UsageError: An argument is out of its range, or the world has no room for a camera.

@@ -183,24 +183,14 @@ def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Fou
 def advance(
     do: Operations,
     c: Constants,
-    turning: Sequence[N],
-    speeds: Four,
-    twist: N,
-    motion: Sequence[N],
-    knock: Three,
-    legs: bool,
+    turning: Sequence[N],  # quaternion (w, x, y, z; world from body) and body rates
+    speeds: Four,  # rotor speeds, which are constant during the step
+    twist: N,  # reaction of the rotors; see :func:`spin`
+    motion: Sequence[N],  # velocity of the air, position and velocity in world axes
+    knock: Three,  # acceleration in world axes by which contacts changed the body's velocity in the last step
+    legs: bool,  # whether any drone may be standing or lying on something that turns it onto its feet
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        turning: Quaternion (w, x, y, z; world from body) and body rates.
-        speeds: Rotor speeds, which are constant during the step.
-        twist: Reaction of the rotors; see :func:`spin`.
-        motion: Velocity of the air, position and velocity in world axes.
-        knock: Acceleration in world axes by which contacts changed the body's velocity in the last step.
-        legs: Whether any drone may be standing or lying on something that turns it onto its feet.
 
     Returns:
         Quaternion and body rates; position and velocity; the specific force along the body's axes during the step; the
