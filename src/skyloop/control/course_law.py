@@ -81,12 +81,7 @@ class CourseSettings:
 
 
 class CourseLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        axis: The vehicle's position in the gate's axes at the last step.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(
         self,
@@ -103,6 +98,7 @@ class CourseLaw(VelocityLaw):
             Part.VELOCITY,
             Part.HEIGHT,
         )
+        #: Phase, and the vehicle's position in the gate's axes, at the last step.
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
         self.way: list[Point] = []  #: the points of the route, in odometry axes
         self.stuck: str | None = None  #: why the vehicle can't continue; None while it can
@@ -110,31 +106,26 @@ class CourseLaw(VelocityLaw):
         self._shift = np.array([-start[0], -start[1], 0.0])  # from map axes to odometry axes
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
-        self._number = 0
+        self.number = 0  #: number of the next gate, from 0
         self._lift: float | None = None  # altitude above the ground minus the odometry's height
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
         self._view = 0  # index of the current viewpoint
         self._begin_gate(0)
 
-    @property
-    def number(self) -> int:
-        """Number of the next gate, from 0."""
-        return self._number
-
     def next_gate(self) -> None:
         """Advance to the next gate. The measured position of the last one corrects the others."""
         if self._seen >= self.settings.sightings:
-            learnt = self._gate_at(self._number) - self._nominal(self._number)
+            learnt = self._gate_at(self.number) - self._nominal(self.number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
             for spot in self._poles:
                 spot.move(share * learnt[:2])
             self._shift = self._shift + share * learnt
             self._shift_m = max(0.1, self._shift_m * math.sqrt(1.0 - share))
-        self._begin_gate(self._number + 1)
+        self._begin_gate(self.number + 1)
 
     def _begin_gate(self, number: int) -> None:
-        self._number, self._seen, self._view = number, 0, 0
+        self.number, self._seen, self._view = number, 0, 0
         self.phase, self.way, self._planned_ns, self._waiting_ns = GatePhase.GOING, [], None, None
         self._passing_ns: int | None = None
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.001, speed_m_s=0.02, gate=5.0)
@@ -146,7 +137,7 @@ class CourseLaw(VelocityLaw):
         """Trust the map only as much as at the start, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
-            self._begin_gate(self._number)
+            self._begin_gate(self.number)
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
@@ -160,7 +151,7 @@ class CourseLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting of the next gate, as in :meth:`GateLaw.see`; ignore it if the gate can't be there."""
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
-        if found is None or self._lift is None or self._number >= len(self._gates):
+        if found is None or self._lift is None or self.number >= len(self._gates):
             return
         motion, to_level = self._motion(captured_ns), found[1]
         distance = float(np.linalg.norm(position))
@@ -174,7 +165,7 @@ class CourseLaw(VelocityLaw):
         middle = motion.position + seen - np.array([*(off * across), 0.0])
         if self._filter.newest is None:
             expected = math.hypot(self.settings.map_m, self._shift_m, 0.05)
-            self._filter.start(self._nominal(self._number), expected, captured_ns)
+            self._filter.start(self._nominal(self.number), expected, captured_ns)
         if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):
             return
         weight = 0.15 * trust / max(1.0, 0.4 * distance)
@@ -207,16 +198,16 @@ class CourseLaw(VelocityLaw):
         return place
 
     def _gate_at(self, number: int) -> Array:
-        newest = self._filter.newest if number == self._number else None
+        newest = self._filter.newest if number == self.number else None
         place: Array = self._nominal(number) if newest is None else newest.position
         return place
 
     def _setpoint(self, now_ns: int) -> Array:
         s = self.settings
-        if self._number >= len(self._gates):
+        if self.number >= len(self._gates):
             return np.zeros(4)
         own = self._motion(now_ns).moved_to(now_ns + nanoseconds(s.lead_s))
-        gate, ahead = self._gate_at(self._number), self._heading
+        gate, ahead = self._gate_at(self.number), self._heading
         left = np.array([-ahead[1], ahead[0]])
         offset = own.position - gate
         self.axis = axis = Axis(float(offset[:2] @ ahead), float(offset[:2] @ left), float(offset[2]))
@@ -298,7 +289,7 @@ class CourseLaw(VelocityLaw):
         if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
             return
         self._planned_ns = now_ns
-        gate, ahead = self._gate_at(self._number)[:2], self._heading
+        gate, ahead = self._gate_at(self.number)[:2], self._heading
         here: Point = (float(own.position[0]), float(own.position[1]))
         if self._seen >= s.sightings:
             goals = [gate - ahead * before for before in s.before_m]
@@ -318,7 +309,7 @@ class CourseLaw(VelocityLaw):
 
     def _hides(self, place: Array, gate: Array, ahead: Array) -> bool:
         """Return whether a pole is between a position and the gate's opening."""
-        half = np.array([-ahead[1], ahead[0]]) * (self._widths[self._number] / 2 + self.settings.frame_m)
+        half = np.array([-ahead[1], ahead[0]]) * (self._widths[self.number] / 2 + self.settings.frame_m)
         corners = [place, gate - half, gate + half]
         edges = [
             (b - a) / max(1e-6, float(np.linalg.norm(b - a)))
@@ -342,12 +333,12 @@ class CourseLaw(VelocityLaw):
             middle = self._gate_at(number)[:2]
             along = (
                 self._heading
-                if number == self._number
+                if number == self.number
                 else np.array([math.cos(place.heading_rad), math.sin(place.heading_rad)])
             )
             half = np.array([-along[1], along[0]]) * (width / 2 + s.frame_m / 2)
             (x, y), (u, v) = (middle - half).tolist(), (middle + half).tolist()
-            spread = s.map_m if number != self._number or not self._seen else 0.0
+            spread = s.map_m if number != self.number or not self._seen else 0.0
             walls.append(Wall((x, y), (u, v), s.frame_m / 2 + s.body_m + s.clearance_m + spread))
         return walls
 

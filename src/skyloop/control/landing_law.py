@@ -170,9 +170,6 @@ class LandingLaw(AirframeLaw):
     """Computes velocities from feedback and sightings. The motors stop when :attr:`phase` is DOWN.
 
     Times are on the proxy's clock [ns].
-
-    Attributes:
-        settings: Settings of the law, as given.
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:

@@ -99,9 +99,9 @@ class TargetFollower(AirframeLaw):
         self._camera = camera
         self._detector = detector
         self._box, self._class_name, self._traits = box, class_name, traits
-        self._finder: TargetFinder | None = None
+        self.finder: TargetFinder | None = None  #: None before the first frame
         self._seen_ns: int | None = None  # capture time of the last frame that showed, or may have shown, the target
-        self._sighting = Sighting(None, None)
+        self.sighting = Sighting(None, None)  #: the result of searching the newest frame
         self._view: Camera | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
         self._trace: deque[tuple[int, Array]] = deque()
@@ -134,19 +134,9 @@ class TargetFollower(AirframeLaw):
         """Whether the follower has given up."""
         return self.phase is TargetPhase.GIVEN_UP
 
-    @property
-    def sighting(self) -> Sighting:
-        """The result of searching the newest frame."""
-        return self._sighting
-
-    @property
-    def finder(self) -> TargetFinder | None:
-        """Finder of the target; None before the first frame."""
-        return self._finder
-
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        if self._finder is None:
+        if self.finder is None:
             self.airframe.by_tilt = feedback.velocity_m_s is None
         super().feedback(feedback)
         if not self._relative and self.airframe.feedback is not None:
@@ -191,8 +181,8 @@ class TargetFollower(AirframeLaw):
         view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
-        if self._finder is None:
-            self._finder = TargetFinder(
+        if self.finder is None:
+            self.finder = TargetFinder(
                 box=self._box,
                 class_name=self._class_name,
                 traits=self._traits,
@@ -201,16 +191,16 @@ class TargetFollower(AirframeLaw):
             )
         found = None if self._detector is None else self._detector.detect(frame)
         self._view, self._frame_ns = view, frame.captured_ns
-        self._sighting = self._finder.see(frame, view, frame.captured_ns, ground=ground, detections=found)
-        if self._sighting.box is not None or self._sighting.contested:
+        self.sighting = self.finder.see(frame, view, frame.captured_ns, ground=ground, detections=found)
+        if self.sighting.box is not None or self.sighting.contested:
             self._seen_ns = frame.captured_ns
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
         """Use a processor's detections for a recent frame, which arrive after that frame."""
-        if self._finder is not None:
+        if self.finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
-            if self._finder.detected(detections, captured_ns, ground=ground):
+            if self.finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
@@ -222,7 +212,7 @@ class TargetFollower(AirframeLaw):
             return Attitude() if self._relative else Velocity()
         self._since_s(now_ns)
         self._seen_ns = not_ahead(self._seen_ns, now_ns)
-        finder = self._finder
+        finder = self.finder
         return self._law.step(
             now_ns,
             self._motion(now_ns),
@@ -237,14 +227,14 @@ class TargetFollower(AirframeLaw):
 
     @property
     def _estimator(self) -> TargetEstimator | None:
-        return None if self._finder is None else self._finder.estimator
+        return None if self.finder is None else self.finder.estimator
 
     @property
     def status(self) -> FollowStatus:
         """The state of the pursuit at the newest frame and set-point."""
         estimator, at_ns = self._estimator, self._frame_ns
-        box, confidence = self._sighting.box, self._sighting.confidence
-        class_name = self._class_name if self._finder is None else self._finder.class_name
+        box, confidence = self.sighting.box, self.sighting.confidence
+        class_name = self._class_name if self.finder is None else self.finder.class_name
         known = FollowStatus(self.phase.value, self.mode, box, confidence, class_name, unknown=self.problem)
         if estimator is None or at_ns is None or self._view is None:
             return known
@@ -265,18 +255,18 @@ class TargetFollower(AirframeLaw):
     def _problem(self) -> str:
         if self.problem:
             return self.problem
-        if self._sighting.contested:
+        if self.sighting.contested:
             return "a look-alike is at its expected position"
         return "at the end of the leash" if self._law.held_by else ""
 
     def _drawing(self, captured_ns: int) -> list[Shape]:
-        assert self._finder is not None
-        view, estimator = self._view, self._finder.estimator
+        assert self.finder is not None
+        view, estimator = self._view, self.finder.estimator
         assert view is not None
-        box = self._sighting.box
+        box = self.sighting.box
         colour = _SEEN if box is not None else _LOST
         # A processor draws its own detections on their frames.
-        found = () if self._detector is None else self._finder.detections[:16]
+        found = () if self._detector is None else self.finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
             return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
@@ -297,8 +287,8 @@ class TargetFollower(AirframeLaw):
         middle = view.pixel(state.middle)
         if middle is not None:
             shapes.append(Points((middle,), colour))
-        sure = "" if self._sighting.confidence is None else f" {self._sighting.confidence:.0%}"
-        name = self._finder.class_name or "target"
+        sure = "" if self.sighting.confidence is None else f" {self.sighting.confidence:.0%}"
+        name = self.finder.class_name or "target"
         text = f"{name}{sure}  {self.phase.value}  {state.range_m:.1f} ± {state.range_deviation_m:.1f} m"
         return [*shapes, Text(text, (8.0, 16.0), colour)]
 

@@ -101,18 +101,6 @@ def plausible(position: Vector, quaternion: Quaternion) -> bool:
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
 
 
-def matrix(quaternion: Quaternion) -> NDArray[np.float64]:
-    """Return the rotation matrix of a quaternion (x, y, z, w), shape (3, 3), float64."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def scipy_types() -> Any:
     """Import SciPy's module of rotations and transforms, of SciPy 1.16 or newer."""
     try:

@@ -78,35 +78,22 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
 
 
 class BodyTable(ABC):
-    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones.
+    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones."""
 
-    Attributes:
-        position: Position of the body's centre, world axes, (3, n) [m].
-        velocity: Velocity of the body's centre, world axes, (3, n) [m/s].
-        velocity_before: Velocity before the last step.
-        angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
-        rates: Derivatives of the angles.
-        sin: Sines of the angles.
-        cos: Cosines of the angles.
-        thrust: Thrust per mass, (n,) [m/s²].
-        attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
-        thrust_command: Input: thrust per mass, (n,).
-        air: Input: velocity of the air, (3, n).
-        commands: For a few drones: the inputs attitude_command and thrust_command.
-        turned: For a few drones: sine of yaw; cosines of roll, pitch, yaw.
-        moved: For a few drones: height of the centre [m], velocity [m/s].
-        most_acceleration_m_s2: Upper bound of every body's acceleration, excluding collisions.
-    """
-
+    #: Upper bound of every body's acceleration, excluding collisions.
     most_acceleration_m_s2 = 60.0  # more than thrust, gravity and drag in a headwind of 10 m/s combined
 
     def __init__(self, positions: Floats, yaws: Floats) -> None:
         n = len(yaws)
         table = columns(_ROWS, n)
         self._table = table
+        #: Roll, pitch, yaw, (3, n) [rad], yaw not wrapped; derivatives; input: roll, pitch [rad], yaw rate [rad/s].
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
+        #: Input and actual value: thrust per mass, (n,) [m/s²].
         self.thrust_command, self.thrust = table[12], table[22]
+        #: Sines and cosines of the angles; input: velocity of the air, (3, n) [m/s].
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
+        #: Position and velocity of the body's centre in world axes, (3, n) [m, m/s]; velocity before the last step.
         self.position, self.velocity, self.velocity_before = (table[row : row + 3] for row in (23, 26, 29))
         self.position[:] = positions
         self.angles[2] = yaws
@@ -114,6 +101,7 @@ class BodyTable(ABC):
         np.cos(self.angles, out=self.cos)
         self._few = few(n)
         if self._few:
+            #: Inputs attitude_command, thrust_command; sine of yaw, cosines of roll, pitch, yaw; height, velocity.
             self.commands, self.turned, self.moved = Fields(table, 9, 4), Fields(table, 15, 4), Fields(table, 25, 4)
 
     @abstractmethod

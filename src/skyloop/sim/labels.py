@@ -86,11 +86,6 @@ class Labeller:
         return tuple(found)
 
 
-def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-    """Return the box of every target and crate with a pixel in the image, as :meth:`Labeller.boxes` does."""
-    return Labeller(scene).boxes(state, pose, model)
-
-
 def pictures(
     world: World,  # the world
     seed: int,  # seed of the positions and times

@@ -28,6 +28,7 @@ from skyloop.sim.rotor_dynamics import (
     spin,
 )
 from skyloop.sim.streams import Floats
+from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
@@ -46,13 +47,6 @@ class RotorBodies(BodyTable):
     Their state is a quaternion, body rates and rotor speeds. Angles with their sines, cosines and derivatives are
     computed at the end of each step. An attitude loop (250 Hz), a rate loop and a mixer (1 kHz) follow the inputs
     ``attitude_command`` and ``thrust_command``, except for drones flown by firmware.
-
-    Attributes:
-        quaternion: Rotation from body to world axes, w, x, y, z, (4, n).
-        turning: Body rates, (3, n) [rad/s].
-        speeds: Rotor speeds, (4, n) [rad/s].
-        voltage: Voltage of the batteries under load, (n,) [V].
-        current: Current of the batteries, (n,) [A].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
@@ -60,7 +54,9 @@ class RotorBodies(BodyTable):
         n = len(parameters)
         self.count = 0  #: number of plant steps
         rows = columns(_ROWS, n)
+        #: Rotation from body to world axes, w, x, y, z, (4, n); body rates, (3, n), and rotor speeds, (4, n) [rad/s].
         self.quaternion, self.turning, self.speeds = rows[0:4], rows[4:7], rows[7:11]
+        #: Voltage under load, (n,) [V], and current, (n,) [A], of the batteries.
         self._force, self.voltage, self.current = rows[11:14], rows[14], rows[15]
         self._targets, self._wanted, self._thrust_wanted = rows[16:20], rows[20:23], rows[23]
         self._knock, self._sag, self._open_voltage = rows[24:27], rows[27], rows[28]
@@ -156,7 +152,7 @@ class RotorBodies(BodyTable):
 
     def body_rates_of(self, drone: int) -> tuple[float, float, float]:
         """Return a drone's angular velocity about its body's axes [rad/s]."""
-        return _three(self.turning[:, drone])
+        return vec3(self.turning[:, drone])
 
     @property
     def time_s(self) -> float:
@@ -282,19 +278,14 @@ class _Pilot:
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,
-            _three(bodies.position[:, drone]),
-            _three(velocity[:, drone]),
+            vec3(bodies.position[:, drone]),
+            vec3(velocity[:, drone]),
             (w, x, y, z),
-            _three(bodies.turning[:, drone]),
-            _three(bodies._force[:, drone]),
+            vec3(bodies.turning[:, drone]),
+            vec3(bodies._force[:, drone]),
             float(bodies.voltage[drone]),
             float(bodies.current[drone]),
         )
         commands = self._firmware.exchange(readings)
         if commands is not None:
             bodies.command(drone, commands)
-
-
-def _three(values: Floats) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z

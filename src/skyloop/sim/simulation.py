@@ -27,7 +27,7 @@ from skyloop.sim.rotors import RotorBodies
 from skyloop.sim.solids import Solids, place
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
-from skyloop.sim.world import TargetState, Vec3, Wind, World
+from skyloop.sim.world import TargetState, Vec3, Wind, World, vec3
 
 LOOP_STEPS = 4  # steps per update of the autopilot's outer loops, altimeter and velocity (62.5 Hz)
 SLOW_STEPS = 25  # steps per update of the batteries and of the wandering biases (10 Hz)
@@ -282,7 +282,7 @@ class Simulation:
                 pitch_rad=inertial[7],
                 yaw_rad=wrap_angle(inertial[8]),
                 altitude_m=float(sensors.altitude[i]),
-                velocity_m_s=_vec3(sensors.velocity[:, i]),
+                velocity_m_s=vec3(sensors.velocity[:, i]),
                 angular_velocity_rad_s=(inertial[0], inertial[1], inertial[2]),
                 acceleration_m_s2=(inertial[3], inertial[4], inertial[5]),
             )
@@ -295,15 +295,15 @@ class Simulation:
             return VehicleTruth(
                 time_s=self.time_s,
                 state=self._autopilot.states[i],
-                position_m=_vec3(bodies.position[:, i]),
-                velocity_m_s=_vec3(bodies.velocity[:, i]),
+                position_m=vec3(bodies.position[:, i]),
+                velocity_m_s=vec3(bodies.velocity[:, i]),
                 roll_rad=roll,
                 pitch_rad=pitch,
                 yaw_rad=wrap_angle(yaw),
                 quaternion=quaternion_from_euler(roll, pitch, yaw),
                 angular_velocity_rad_s=bodies.body_rates_of(i),
                 thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
-                wind_m_s=_vec3(bodies.air[:, i]),
+                wind_m_s=vec3(bodies.air[:, i]),
                 battery=float(self._batteries.charge[i]),
             )
 
@@ -367,8 +367,3 @@ def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
     if len(have) > 1:
         raise UsageError("vehicles with and without rotors (VehicleParameters.rotors) need separate simulations")
     return have.pop()
-
-
-def _vec3(values: Floats) -> Vec3:
-    x, y, z = values.tolist()
-    return (x, y, z)

@@ -31,8 +31,9 @@ class Solids:
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
         movers = [(track, track.target) for track in tracks if isinstance(track.target, PlatformTarget | FigureTarget)]
-        self._fixed = len(boxes)
+        self.fixed = len(boxes)  #: number of fixed solids
         self._movers = [track for track, _ in movers]
+        self.moving = bool(movers)  #: whether any of the solids is moving
         self._lifts = [isinstance(target, PlatformTarget) for _, target in movers]
         sizes = [box.size_m for box in boxes] + [target.size_m for _, target in movers]
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
@@ -54,23 +55,13 @@ class Solids:
         self.top_speed_m_s = max((_top_speed(target) for _, target in movers), default=0.0)
         self.move(0.0)
 
-    @property
-    def moving(self) -> bool:
-        """Whether any of the solids is moving."""
-        return bool(self._movers)
-
     def __len__(self) -> int:
         """Return the number of boxes, platforms and figures. They are numbered, with moving ones last."""
         return len(self._boxes)
 
-    @property
-    def fixed(self) -> int:
-        """Number of fixed solids."""
-        return self._fixed
-
     def move(self, time_s: float) -> None:
         """Move the moving solids to their positions at a point in time."""
-        for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
+        for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self.fixed):
             state = track.at(time_s)
             x, y, z = state.position_m  # a platform's top, a figure's footprint
             half = float(self._half[2, number, 0])
@@ -86,9 +77,9 @@ class Solids:
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
-            self._bound(slice(0, self._fixed), 0.0)
+            self._bound(slice(0, self.fixed), 0.0)
         if self._movers:
-            self._bound(slice(self._fixed, None), self.top_speed_m_s * seconds)
+            self._bound(slice(self.fixed, None), self.top_speed_m_s * seconds)
         return self._bounds
 
     def _bound(self, which: slice, reach_m: float) -> None:
@@ -207,7 +198,7 @@ class Solids:
 
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
-        if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
+        if number >= self.fixed and self._lifts[number - self.fixed] and local[2] > 0:
             axis = 2  # a platform lifts everything on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]

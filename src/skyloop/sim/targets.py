@@ -33,6 +33,7 @@ from skyloop.sim.world import (
     WalkPath,
     WaypointPath,
     Yaw,
+    vec3,
 )
 
 GRID_S = 0.02  # spacing of the points, between which motion is linear
@@ -77,7 +78,7 @@ class TargetTrack:
         walked = first.walked + part * (second.walked - first.walked)
         place = (position[0], position[1], position[2])
         # Use the velocity between the points, not at the first one; otherwise a drone on a platform would creep.
-        velocity = _vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
+        velocity = vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
         rate = (second.yaw - first.yaw) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
 
@@ -131,7 +132,7 @@ def _waypoints(path: WaypointPath) -> Iterator[tuple[Vec3, Vec3]]:
         distance = step * GRID_S * path.speed_m_s % ends[-1]
         leg = next((n for n, end in enumerate(ends) if distance < end), len(ends) - 1)
         along = 1.0 - (ends[leg] - distance) / lengths[leg]
-        yield _vec3(starts[leg] + along * legs[leg]), _vec3(legs[leg] * (path.speed_m_s / lengths[leg]))
+        yield vec3(starts[leg] + along * legs[leg]), vec3(legs[leg] * (path.speed_m_s / lengths[leg]))
 
 
 def _circle(path: CirclePath, time_s: float) -> tuple[Vec3, Vec3]:
@@ -164,12 +165,12 @@ def _lissajous(path: LissajousPath, time_s: float) -> tuple[Vec3, Vec3]:
     rates = 2 * math.pi * np.array(path.cycles) / path.period_s
     angles = rates * time_s + np.array(path.phase_rad)
     amplitude = np.array(path.amplitude_m)
-    return _vec3(np.array(path.centre_m) + amplitude * np.sin(angles)), _vec3(amplitude * rates * np.cos(angles))
+    return vec3(np.array(path.centre_m) + amplitude * np.sin(angles)), vec3(amplitude * rates * np.cos(angles))
 
 
 def _walk_goals(path: WalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
     while True:
-        yield _vec3(rng.uniform(path.low_m, path.high_m))
+        yield vec3(rng.uniform(path.low_m, path.high_m))
 
 
 def _ring_goals(path: RingWalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
@@ -195,7 +196,7 @@ def _steer(
     velocity = np.zeros(3)
     speed = float(rng.uniform(*speeds))
     while True:
-        yield _vec3(position), _vec3(velocity)
+        yield vec3(position), vec3(velocity)
         way = goal - position
         distance = float(np.linalg.norm(way))
         while distance < speed * speed / (2 * acceleration) + 0.02:
@@ -234,7 +235,3 @@ def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:
     if math.hypot(velocity[0], velocity[1]) < 0.02:
         return None
     return math.atan2(velocity[1], velocity[0]) + yaw.offset_rad
-
-
-def _vec3(values: np.typing.NDArray[np.float64]) -> Vec3:
-    return (float(values[0]), float(values[1]), float(values[2]))

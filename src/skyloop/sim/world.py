@@ -19,6 +19,13 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Rgb = tuple[int, int, int]
 
+
+def vec3(values: NDArray[np.float64]) -> Vec3:
+    """Return three numbers of an array as plain floats."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 # Surface names that a renderer must support. A world file with any other name is refused.
 TEXTURES: tuple[str, ...] = (
     "asphalt",

@@ -16,8 +16,8 @@ import numpy as np
 
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import within
+from skyloop.vision.lens import pixels_of
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import (
     LEAST_PX,
     Box,

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from skyloop.messages import CameraInfo, Feedback, Intrinsics
 from skyloop.poses import mounting_rotation
-from skyloop.vision.lens import normalised
+from skyloop.vision.lens import checked, normalised
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import checked
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.vision.lens import normalised, project
+from skyloop.vision.lens import checked, normalised, project
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, rectangle
+from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, rectangle
 
 Rgb = tuple[int, int, int]
 

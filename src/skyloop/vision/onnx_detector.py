@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import MAX_TEXT, read_text
+from skyloop.vision.lens import pixels_of
 from skyloop.vision.object_tracks import Detection, Floats, suppress
 from skyloop.vision.onnx import load_network, reason
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import Image
 
 

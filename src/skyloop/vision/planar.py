@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.poses import mounting_rotation, transform
-from skyloop.vision.lens import normalised
+from skyloop.vision.lens import checked, normalised
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 if TYPE_CHECKING:
@@ -112,38 +112,6 @@ def rectangle(width_m: float, height_m: float) -> Array:
     """Return a rectangle's corners in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
     x, y = width_m / 2, height_m / 2
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
-
-
-def checked(
-    image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
-) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image and return its pixels as a plain array, together with its intrinsics.
-
-    Args:
-        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        intrinsics: Intrinsics of the camera; None uses the frame's own.
-        colour: Whether to refuse grey images.
-
-    Raises:
-        UsageError: The array has a wrong shape or type or is empty, or there are no intrinsics.
-    """
-    if intrinsics is None:
-        intrinsics = getattr(image, "intrinsics", None)
-    if intrinsics is None:
-        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
-    return pixels_of(image, colour=colour), intrinsics
-
-
-def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
-    """Check an image as :func:`checked` does and return its pixels as a plain array that shares its memory."""
-    pixels = np.asarray(image)
-    grey = pixels.ndim == 2 and not colour
-    if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):
-        wanted = "(h, w, 3)" if colour else "(h, w, 3) or (h, w)"
-        raise UsageError(f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
-    if pixels.size == 0:
-        raise UsageError("the image is empty")
-    return pixels
 
 
 #: The largest dictionary of each family, which contains the smaller ones' markers with the same ids.

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from skyloop.errors import FileFormatError, UnsupportedError, UsageError
 from skyloop.messages.geometry import within
 from skyloop.vision import onnx
+from skyloop.vision.lens import pixels_of
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import pixels_of
 
 Box = tuple[float, float, float, float]  #: x, y, width, height [px]
 Image = NDArray[np.uint8]
