@@ -21,14 +21,11 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, within
+from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimiter, SetpointLimits, clamped, within
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
-
-Array = NDArray[np.float64]
 
 STALE_S: Final = 0.5  #: maximum age of a known value; after a longer gap the odometry may have jumped
 #: Drag on a small quadrotor at some metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.

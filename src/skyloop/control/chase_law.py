@@ -16,12 +16,20 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import DRAG_PER_S, Motion
 from skyloop.control.filters import LowPass
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, lowered, shortened, within
+from skyloop.control.limiting import (
+    GRAVITY_M_S2,
+    Array,
+    SetpointLimiter,
+    SetpointLimits,
+    clamped,
+    lowered,
+    shortened,
+    within,
+)
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
@@ -142,8 +150,6 @@ class ChaseSettings:
             lean_rad=lowered(self.lean_rad, limits, "limits.tilt"),
         )
 
-
-Array = NDArray[np.float64]
 
 _SMOOTHING_S = 0.4  # time constant of the target's acceleration
 _SETPOINT_OVER = 1.5  # set-point limit as a multiple of the top speed: drag keeps a vehicle below its set-point

@@ -13,18 +13,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, VelocityLaw
 from skyloop.control.gate_law import Axis, GatePhase, Point, Wall, detour
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.estimation import corrected
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
-Array = NDArray[np.float64]
 _SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
 _TILT_RAD = 0.012  # standard deviation of an elevation, from errors of the attitude and of a pole's top in the image
 _REPEATED = 3.0  # factor on the noise, because errors repeat from one sighting to the next

@@ -15,13 +15,12 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, TurningSearch, VelocityLaw
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.messages import Feedback, Points, Polyline, Text
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.relayed import Colour, Shape
@@ -29,8 +28,6 @@ from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
-
-Array = NDArray[np.float64]
 
 
 class Mode(StrEnum):

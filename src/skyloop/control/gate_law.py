@@ -21,16 +21,14 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Part, TurningSearch, VelocityLaw
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]
 
 _AROUND = 8  # number of graph points around each end of a wall

@@ -19,13 +19,12 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimits, clamped, require_positive, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimits, clamped, require_positive, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
@@ -40,8 +39,6 @@ from skyloop.vision.planar import rectangle
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
-
-Array = NDArray[np.float64]
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:

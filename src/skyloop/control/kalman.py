@@ -16,14 +16,12 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import require_positive, within
+from skyloop.control.limiting import Array, require_positive, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
-Array = NDArray[np.float64]
 #: Added to an innovation's variance so that a nearly exact state does not cause a division by zero.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 

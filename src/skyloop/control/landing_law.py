@@ -18,12 +18,12 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Motion, Part
 from skyloop.control.kalman import TurnEstimate, TurningTargetFilter
 from skyloop.control.limiting import (
+    Array,
     SetpointLimiter,
     SetpointLimits,
     clamped,
@@ -129,8 +129,6 @@ class LandingSettings:
             search_height_m=lowered(self.search_height_m, limits, "limits.altitude", _BELOW_CEILING_M),
         )
 
-
-Array = NDArray[np.float64]
 
 _KEPT_S = 2.0  # duration of the history of estimates, kept to check how well the motion was predicted
 _MOST_REFUSED = 4  # sightings in a row outside the gate after which the filter restarts

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from skyloop.control.limiting import within
+from skyloop.control.limiting import Array, within
 from skyloop.errors import MissingExtraError, UsageError
 
 #: Shorter stretches are skipped because the squares of their speeds would underflow a float.
@@ -89,7 +89,6 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
     return speeds
 
 
-Array = NDArray[np.float64]
 _DIFFERENCE_S = 0.01  # step of the numerical derivative on either side
 
 #: Lengths, speeds, accelerations and times in this range can be divided without under- or overflow.

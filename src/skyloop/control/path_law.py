@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.controller import Controller
-from skyloop.control.limiting import SetpointLimiter, SetpointLimits, lowered, require_positive, within
+from skyloop.control.limiting import Array, SetpointLimiter, SetpointLimits, lowered, require_positive, within
 from skyloop.control.path import Path, Polyline
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.control.waypoint import Fix, PositionSource, Waypoint, fix_of, lacking
@@ -30,7 +30,6 @@ from skyloop.messages.geometry import turned, wrap_angle
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-Array = NDArray[np.float64]
 _LONGEST_STEP_S = 0.5  # maximum time by which the path advances between two fixes
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
 _SHARE = 0.6  # limit of the integral as a fraction of the maximum speed

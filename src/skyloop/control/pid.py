@@ -12,14 +12,11 @@ import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.control.filters import LowPass, gain
-from skyloop.control.limiting import clamped, require_positive, shortened, within
+from skyloop.control.limiting import Array, clamped, require_positive, shortened, within
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import wrap_angle
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

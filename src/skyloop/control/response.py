@@ -17,17 +17,14 @@ from collections import deque
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
-from skyloop.control.limiting import GRAVITY_M_S2, require_positive, shortened, within
+from skyloop.control.limiting import GRAVITY_M_S2, Array, require_positive, shortened, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
-
-Array = NDArray[np.float64]
 
 _STEP_S = 0.01  # time step of the prediction
 _LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion during it is unknown

@@ -22,18 +22,15 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.limiting import within
+from skyloop.control.limiting import Array, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 from skyloop.messages import CameraInfo, Feedback, Intrinsics
 from skyloop.poses import mounting_rotation
 from skyloop.vision.lens import project, unproject
 from skyloop.vision.tracking import Box
-
-Array = NDArray[np.float64]
 
 _CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off ...
 _CUT: Final = 0.07

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import seconds
 from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
 from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.limiting import Array
 from skyloop.control.target_estimate import Camera, TargetEstimator, Traits, predicted_box
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.errors import UsageError
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
     from skyloop.client.results import Result
 
-
-Array = NDArray[np.float64]
 
 _SEEN: Final[Colour] = (64, 220, 100)
 _LOST: Final[Colour] = (255, 180, 60)

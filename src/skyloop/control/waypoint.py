@@ -72,18 +72,9 @@ def lacking(feedback: Feedback) -> str:
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
-    """Compute the velocity that brings a vehicle to a waypoint.
+    """Compute the velocity that brings a vehicle to a waypoint, in the body's levelled axes [m/s, rad/s].
 
-    Args:
-        goal: The waypoint to fly to.
-        feedback: The vehicle's newest feedback, including position and yaw.
-        settings: Gains and limits; None for the defaults.
-
-    Returns:
-        Set-point in the body's levelled axes [m/s, rad/s].
-
-    Raises:
-        UsageError: Position or yaw is unknown.
+    UsageError if the vehicle's position or yaw is unknown.
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)

@@ -125,14 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return the deepest overlap of a drone; None if there is none.
-
-        Args:
-            point: The drone's centre, three numbers [m].
-            radius: Radius of the hull [m].
-            half_height: Half height of the hull [m].
-            among: Solids to check in addition to the room; None for all.
-        """
+        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all); None without one."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None
@@ -163,12 +156,9 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance to the first solid, including the floor [m]; infinite if there is none.
+        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite without one.
 
-        Args:
-            point: Start of a beam, whose length is 0 if it starts below the floor.
-            direction: Direction of the beam, a unit vector.
-            time_s: Simulation time, which determines the positions of moving solids.
+        It is 0 from a point below the floor.
         """
         if self._movers:
             self.move(time_s)
@@ -242,13 +232,8 @@ Indices = NDArray[np.intp]
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
     """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
 
-    Args:
-        low: Minimum coordinates of the boxes, shape (3, n) [m].
-        high: Maximum coordinates, shape (3, n).
-        movable: Number of first boxes, at least one of which must be in each pair.
-
-    Returns:
-        The lower and the higher number in each pair, in ascending order. Boxes that touch count as overlapping.
+    Boxes go from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one of a pair is among the
+    first ``movable`` ones. The pairs' lower and higher numbers are in ascending order.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -276,11 +261,7 @@ _MARGINS_M = (0.6, 0.3, 0.15)  # distances between hulls and to obstacles; the f
 
 
 def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
-    """Return a free starting position for each drone: first the world's own, then a grid around the first of them.
-
-    Raises:
-        UsageError: There are not enough positions, or one of the world's own is inside a solid.
-    """
+    """Return a free starting position for each drone: first the world's own, then a grid around the first of them."""
     spawns = list(world.spawns[: len(parameters)])
     for spawn, drone in zip(spawns, parameters, strict=False):
         if not _is_clear(spawn, drone, solids, 0.0):

@@ -63,11 +63,7 @@ class TargetTrack:
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> TargetState:
-        """Return the state at a simulation time [s].
-
-        Raises:
-            UsageError: The time is before the start or more than :data:`KEPT_S` before the latest requested time.
-        """
+        """Return the state at a simulation time [s]."""
         if not (math.isfinite(time_s) and time_s >= 0):
             raise UsageError(f"time must be a finite number of at least 0 s, not {time_s!r}")
         index, part = divmod(time_s / GRID_S, 1.0)

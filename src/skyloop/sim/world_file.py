@@ -563,11 +563,7 @@ Varied = BoxTable | GateTable | SpawnTable
 
 
 def place_varied(table: WorldTable, seed: int, place: Place) -> None:
-    """Move varied objects to positions determined by the seed, uniformly within their ranges.
-
-    Raises:
-        FileFormatError: The objects do not fit at the distance ``apart``.
-    """
+    """Move varied objects to positions determined by the seed, uniformly within their ranges."""
     things = _varied(table)
     if not things:
         return

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from skyloop.calibration import Calibration
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.files import replacing
+from skyloop.vision.lens import Array
 from skyloop.vision.opencv import marker_dictionary, opencv
 
-Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
 _MARKER_SHARE = 0.74  # marker's side as a fraction of the square's side

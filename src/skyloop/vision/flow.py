@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from skyloop.messages import CameraInfo, Feedback, Intrinsics
 from skyloop.poses import mounting_rotation
-from skyloop.vision.lens import checked, normalised
+from skyloop.vision.lens import Array, checked, normalised
 from skyloop.vision.opencv import opencv
-
-Array = NDArray[np.float64]
 
 _MOST: Final = 80  # maximum number of tracked corners
 _ENOUGH: Final = 8  # minimum number of corners for a position

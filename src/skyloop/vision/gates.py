@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.vision.lens import checked, normalised, project
+from skyloop.vision.lens import Array, checked, normalised, project
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, rectangle
+from skyloop.vision.planar import PlanarPose, PlanarSighting, rectangle
 
 Rgb = tuple[int, int, int]
 

@@ -28,15 +28,10 @@ _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversi
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image and return its pixels as a plain array, together with its intrinsics.
+    """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
 
-    Args:
-        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        intrinsics: Intrinsics of the camera; None uses the frame's own.
-        colour: Whether to refuse grey images.
-
-    Raises:
-        UsageError: The array has a wrong shape or type or is empty, or there are no intrinsics.
+    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
+    wrong shape or type, an empty array, or without intrinsics.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -107,18 +102,7 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z (n, 2) of the viewing directions of pixels.
-
-    Args:
-        pixels: Shape (n, 2).
-        intrinsics: Intrinsics of the camera.
-
-    Returns:
-        The values; NaN also for directions beside or behind the camera.
-
-    Raises:
-        UsageError: The shape is wrong, or the model is unknown.
-    """
+    """Return x/z and y/z (n, 2) of the directions of pixels (n, 2); NaN also for those beside or behind the camera."""
     if not _is_fisheye(intrinsics):
         return _ideal(_rows(pixels, 2), intrinsics)
     rays = unproject(pixels, intrinsics)

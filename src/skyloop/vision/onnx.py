@@ -28,17 +28,8 @@ _CHILD: Final = (
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
     """Load a network after a child process has loaded and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
-    Args:
-        path: The ONNX file.
-        threads: CPU threads for one run.
-        purpose: The feature that needs it; a noun phrase for the error message.
-
-    Returns:
-        The exceptions that running the network can raise, and ONNX Runtime's session.
-
-    Raises:
-        MissingExtraError: ONNX Runtime is not installed.
-        FileFormatError: The file is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
+    Return the exceptions that running it can raise, and ONNX Runtime's session. ``purpose`` is a noun phrase for the
+    error message. FileFormatError if ONNX Runtime can't load the file within the limits.
     """
     try:
         import onnxruntime

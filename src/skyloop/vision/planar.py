@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.poses import mounting_rotation, transform
-from skyloop.vision.lens import checked, normalised
+from skyloop.vision.lens import Array, checked, normalised
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
