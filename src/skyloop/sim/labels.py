@@ -19,7 +19,7 @@ from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
 from skyloop.sim.render.painter import Raster
 from skyloop.sim.render.quads import Image
-from skyloop.sim.render.visibility import DepthBuffer, visible_quads
+from skyloop.sim.render.shading import DepthBuffer, visible_quads
 from skyloop.sim.solids import Solids
 from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack

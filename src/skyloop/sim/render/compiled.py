@@ -22,8 +22,7 @@ from skyloop.sim.camera import BOTTOM_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import kernels, shading
 from skyloop.sim.render.painter import Painter, Raster
 from skyloop.sim.render.quads import GAP, Atlas, AtlasBuilder, Floats, Image, QuadBuilder, Quads
-from skyloop.sim.render.shading import Placed
-from skyloop.sim.render.visibility import EDGE_ON_M, PRIORITY_SHARE
+from skyloop.sim.render.shading import EDGE_ON_M, PRIORITY_SHARE, Placed
 
 _log = logging.getLogger(__name__)
 _CONSTANTS: Final = np.array(

@@ -1,7 +1,7 @@
 """The planar renderer's work as loops over quads and pixels that Numba can compile (``compiled``).
 
-The loops compute the same as ``visibility`` and ``shading``, operation by operation in the same order and precision, so
-the image is identical bit by bit; those modules explain the mathematics. They also run uncompiled, slowly, for tests
+The loops compute the same as ``shading``, operation by operation in the same order and precision, so
+the image is identical bit by bit; that module explains the mathematics. They also run uncompiled, slowly, for tests
 without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
 hold the interpreter lock.
 

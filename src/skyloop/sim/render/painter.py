@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraModel, CameraPose, Distortion
 from skyloop.sim.render.quads import Atlas, Image, Quads, cv2
-from skyloop.sim.render.shading import Placed, Rays, Shader, darken, sampling_table
-from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
+from skyloop.sim.render.shading import DepthBuffer, Grid, Placed, Rays, Shader, darken, sampling_table, visible_quads
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
 
-The first step finds the quad at each sample of the image (``visibility``); the second colours each pixel once
+The first step finds the quad at each sample of the image, and the second colours each pixel once
 (``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
 coloured and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens:
 nothing is resampled, and textures stay sharp.
