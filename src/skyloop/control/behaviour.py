@@ -42,9 +42,6 @@ class Behaviour(Controller):
 
     Attributes:
         name: Source of the annotations, and prefix of the events' text.
-        done: Whether the behaviour has reached its end.
-        blind: Whether the vehicle hovers because no frames arrive.
-        problem: The missing part of the vehicle's state that makes it hover; empty if nothing is missing.
     """
 
     name = "behaviour"  #: source of the annotations, and prefix of the events' text

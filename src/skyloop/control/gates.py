@@ -19,10 +19,7 @@ from skyloop.vision import GateDetector, GateSighting, PoleDetector
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-_COLOURS: dict[GatePhase, Colour] = {
-    GatePhase.SEARCHING: (120, 190, 255),
-    GatePhase.RECOVERING: (255, 180, 60),
-}
+_COLOURS: dict[GatePhase, Colour] = {GatePhase.SEARCHING: (120, 190, 255), GatePhase.RECOVERING: (255, 180, 60)}
 _SEEN: Colour = (64, 220, 100)
 
 

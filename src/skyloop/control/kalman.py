@@ -189,19 +189,10 @@ class _Filter(ABC, Generic[_E]):
 
 
 class ConstantVelocityFilter(_Filter[Estimate]):
-    """A Kalman filter for a point that moves at constant velocity with random accelerations.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """A Kalman filter for a point that moves at constant velocity with random accelerations."""
 
     def __init__(
-        self,
-        dimensions: int = 3,
-        *,
-        intensity_m2_s3: float = 0.05,
-        speed_m_s: float = 0.7,
-        gate: float = 5.0,
+        self, dimensions: int = 3, *, intensity_m2_s3: float = 0.05, speed_m_s: float = 0.7, gate: float = 5.0
     ) -> None:
         """Initialise the filter.
 
@@ -248,11 +239,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from measured positions (3,), each with one deviation greater than 0.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """Estimates a point's motion in levelled axes from measured positions (3,), each with one deviation greater than 0."""
 
     def __init__(
         self,

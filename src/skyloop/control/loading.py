@@ -24,19 +24,10 @@ Stamp = tuple[int, int, int]  #: value that changes when a file is saved: time [
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """Load the controller class from a Python file.
+    """Load the controller class from a Python file, by its name in case the file has several.
 
     The file is executed and can import modules next to it, as a script can. Imported classes count only if the file
-    itself defines no controller.
-
-    Args:
-        path: The Python file.
-        class_name: Name of the class, in case the file has several.
-
-    Raises:
-        FileFormatError: The file can't be read or executed (with the line), or has no controller.
-        UnknownNameError: The file has no class with that name.
-        UsageError: The file does not exist, or it has several controllers and no name was given.
+    itself defines no controller. FileFormatError names the line that can't be executed.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")

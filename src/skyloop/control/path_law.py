@@ -142,12 +142,7 @@ class PathSettings:
 
 
 class PathLaw:
-    """Computes velocities from fixes. The path's time starts with the first fix.
-
-    Attributes:
-        time_s: Current time on the path.
-        off_m: Distance from the target on the path at the last fix.
-    """
+    """Computes velocities from fixes. The path's time starts with the first fix."""
 
     def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
         """Initialise the law.

@@ -81,25 +81,15 @@ Action = Look | Wait | Photo
 
 
 class RouteWaypoint(_Part, frozen=True):
-    """A waypoint of a route.
+    """A waypoint of a route."""
 
-    Attributes:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        speed: Maximum speed on the way there [m/s]; None for the route's.
-        yaw: Yaw to turn to on the way there [rad]; None keeps the current yaw.
-        look_at: Point (x, y) to face instead of a fixed yaw [m].
-        actions: Actions to perform there, in this order.
-    """
-
-    x: Metres
-    y: Metres
-    z: Metres
-    speed: Speed | None = None
-    yaw: Angle | None = None
-    look_at: Point | None = None
-    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()
+    x: Metres  #: east [m]
+    y: Metres  #: north [m]
+    z: Metres  #: up [m]
+    speed: Speed | None = None  #: maximum speed on the way there [m/s]; None for the route's
+    yaw: Angle | None = None  #: yaw to turn to on the way there [rad]; None keeps the current yaw
+    look_at: Point | None = None  #: point (x, y) to face instead of a fixed yaw [m]
+    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform there, in this order
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,23 +114,18 @@ class RouteWaypoint(_Part, frozen=True):
 class Route(_Part, frozen=True, kw_only=True):
     """A route.
 
-    Attributes:
-        waypoints: Waypoints in flight order.
-        name: A human-readable name.
-        speed: Maximum speed towards waypoints that don't have their own [m/s].
-        end: What to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of
-            the route at the last waypoint's height and lands.
-        version: Version of the file format.
-
     Raises:
         UsageError: A number is not finite, or there are no waypoints.
     """
 
+    #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
-    name: Name = ""
-    speed: Speed = 0.5
+    name: Name = ""  #: A human-readable name
+    speed: Speed = 0.5  #: maximum speed towards waypoints that don't have their own [m/s]
+    #: what to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of the
+    #: route at the last waypoint's height and lands
     end: Literal["hover", "land", "return"] = "hover"
-    version: Literal[1] = VERSION
+    version: Literal[1] = VERSION  #: version of the file format
 
     def __post_init__(self) -> None:
         super().__post_init__()

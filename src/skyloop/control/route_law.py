@@ -18,16 +18,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.client.actions import OVERRULED
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.controller import Controller
-from skyloop.control.route import (
-    Action,
-    Look,
-    Photo,
-    Route,
-    RouteCheck,
-    RouteWaypoint,
-    Wait,
-    check_for,
-)
+from skyloop.control.route import Action, Look, Photo, Route, RouteCheck, RouteWaypoint, Wait, check_for
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.extend import ask, commands, let_go

@@ -77,13 +77,7 @@ class TargetFollower(AirframeLaw):
         traits: Traits | None = None,  # prior knowledge about the target; None for that of its class
         settings: ChaseSettings | None = None,  # settings of the law; None for the defaults
     ) -> None:
-        """Initialise the follower.
-
-        Raises:
-            UsageError: There is neither a box nor a class, a class has no detections, the camera does not look forward,
-                or its mounting is unknown.
-            MissingExtraError: OpenCV or, for detections, SciPy is not installed.
-        """
+        """Initialise the follower; UsageError without a target, or for a camera that does not look forward."""
         if mounting_rotation(camera)[0, 2] < 0.5:
             raise UsageError(f"camera {camera.name!r} does not look forward, as following needs")
         if box is None and class_name is None:

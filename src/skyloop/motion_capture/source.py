@@ -258,9 +258,7 @@ class TruthSource:
         return take
 
 
-def true_pose(
-    feedback: Feedback,
-) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
+def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
     """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None if missing."""
     native = feedback.native or {}
     try:

@@ -128,11 +128,7 @@ def pictures(
 
 
 def _camera(
-    world: World,
-    solids: Solids,
-    targets: tuple[TargetState, ...],
-    rng: np.random.Generator,
-    tilt_rad: float | None,
+    world: World, solids: Solids, targets: tuple[TargetState, ...], rng: np.random.Generator, tilt_rad: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     half_x, half_y, top = world.room.size_m[0] / 2, world.room.size_m[1] / 2, world.room.size_m[2]
     hull = np.full((3, 1), _CLEAR_M)

@@ -32,10 +32,8 @@ from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
-# Rows of the table of a body's state and inputs, in addition to those of BodyTable.
-_TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
-_TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
-_ROWS = 29
+# First rows, and number, of the table of a body's state and inputs, in addition to those of BodyTable.
+_TURNING, _SPEEDS, _TARGETS, _ROWS = 0, 7, 16, 29
 _AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; cosine near the vertical
 _IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %
 _ROTOR_MARGIN_M_S2 = 60.0  # margin for gravity, ground effect, and drag in a fast dive

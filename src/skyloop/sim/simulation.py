@@ -105,11 +105,6 @@ class Simulation:
         return len(self.parameters)
 
     @property
-    def step_count(self) -> int:
-        """Number of finished steps."""
-        return self._step
-
-    @property
     def time_s(self) -> float:
         """Simulation time: finished steps times :data:`~skyloop.sim.dynamics.STEP_S`."""
         return self._step * STEP_S

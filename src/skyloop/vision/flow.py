@@ -29,11 +29,7 @@ _LOWEST_M: Final = 0.15  # minimum height; any closer to the ground, the image h
 
 
 class GroundTracker:
-    """Tracks the ground in a downward camera's frames and computes the vehicle's position relative to its start.
-
-    Attributes:
-        place: Position at the last frame, (2,) [m]: along yaw 0, and to the left of that direction.
-    """
+    """Tracks the ground in a downward camera's frames and computes the vehicle's position relative to its start."""
 
     def __init__(self, camera: CameraInfo) -> None:
         """Initialise the tracker.

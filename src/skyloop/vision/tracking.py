@@ -215,15 +215,7 @@ def features(cv: Any, pixels: Image) -> Floats:
     cos, sin = x / strength, y / strength
     twice_cos, twice_sin = x * cos - y * sin, 2 * x * sin  # strength times the cosine and sine of twice the angle
     cos2, sin2 = twice_cos / strength, twice_sin / strength
-    maps = [
-        strength,
-        x,
-        y,
-        twice_cos,
-        twice_sin,
-        twice_cos * cos2 - twice_sin * sin2,
-        2 * twice_cos * sin2,
-    ]
+    maps = [strength, x, y, twice_cos, twice_sin, twice_cos * cos2 - twice_sin * sin2, 2 * twice_cos * sin2]
     cells = [cv.resize(one, size, interpolation=cv.INTER_AREA) for one in maps]
     around = cv.blur(cells[0], (3, 3)) + np.float32(4.0)  # 4 grey levels: noise on a flat wall is not texture
     light = [(plain[0] - plain[0].mean()) / np.float32(64.0)]

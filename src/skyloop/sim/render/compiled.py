@@ -179,9 +179,7 @@ class Compiler:
 def load_kernels() -> Kernels:
     """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
-    Raises:
-        ImportError: Numba is not installed.
-        RuntimeError: Numba's cache is not writable, so every start would spend seconds on compilation.
+    RuntimeError if Numba's cache is not writable, so that every start would spend seconds on compilation.
     """
     import numba
 

@@ -13,7 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.sim.render.quads import AtlasBuilder, Floats, QuadBuilder, Quads, Texture, concatenate, cv2, moved_each
+from skyloop.sim.render.quads import (
+    AtlasBuilder,
+    Floats,
+    Image,
+    QuadBuilder,
+    Quads,
+    Texture,
+    concatenate,
+    cv2,
+    moved_each,
+)
 from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_paint, draw_surface, finished, paint, tinted
 from skyloop.sim.world import (
@@ -27,8 +37,6 @@ from skyloop.sim.world import (
     Target,
     Vec3,
 )
-
-Image = NDArray[np.uint8]
 
 _STRIDE_M = 1.5  #: distance covered by two steps
 _SWING_RAD = 0.52  # swing of a leg to either side

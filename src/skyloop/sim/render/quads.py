@@ -70,24 +70,19 @@ class AtlasBuilder:
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
-        self._images: list[NDArray[np.uint8]] = []
+        self.images: list[Image] = []  #: textures so far by number, BGR, shape (h, w, 3)
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
         """Return the texture for ``key``. If there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
-            self._known[key] = Texture(len(self._images), image.shape[1], image.shape[0])
-            self._images.append(image)
+            self._known[key] = Texture(len(self.images), image.shape[1], image.shape[0])
+            self.images.append(image)
         return self._known[key]
-
-    @property
-    def images(self) -> list[NDArray[np.uint8]]:
-        """Return the textures so far in the order of their numbers, BGR, shape (h, w, 3)."""
-        return self._images
 
     def pack(self) -> Atlas:
         """Pack all textures on shelves, starting with the tallest."""
-        sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self._images]
+        sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self.images]
         width = max(2048, *(_footprint(w) for w, _ in sizes))
         spots: dict[int, tuple[int, int]] = {}
         x = y = shelf = 0
@@ -102,7 +97,7 @@ class AtlasBuilder:
         if width > _LIMIT or height > _LIMIT:
             raise ValueError(f"the scene's textures need {width}x{height} texels, more than {_LIMIT} a side")
         image = np.zeros((height, width, 4), np.uint8)
-        for k, source in enumerate(self._images):
+        for k, source in enumerate(self.images):
             _place(image, source, *spots[k], *sizes[k])
         corners = np.array([spots[k] for k in range(len(sizes))], dtype=np.float64)
         span = np.array([2.0 * w for w, _ in sizes])
@@ -274,11 +269,7 @@ class QuadBuilder:
         )
 
     def box(
-        self,
-        low: ArrayLike,
-        high: ArrayLike,
-        sides: Texture | tuple[Texture, Texture],
-        ends: Texture | None = None,
+        self, low: ArrayLike, high: ArrayLike, sides: Texture | tuple[Texture, Texture], ends: Texture | None = None
     ) -> None:
         """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 

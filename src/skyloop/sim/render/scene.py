@@ -284,12 +284,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
     """Add the ground around the room's floor, as far as it is visible, and a sky."""
     x, y, far = room.size_m[0] / 2, room.size_m[1] / 2, _AFAR_M
     ground = _surface(atlas, room.floor, 2 * far, 2 * far, 512 / (2 * far))
-    for low, high in (
-        ((-far, -far), (far, -y)),
-        ((-far, y), (far, far)),
-        ((-far, -y), (-x, y)),
-        ((x, -y), (far, y)),
-    ):
+    for low, high in (((-far, -far), (far, -y)), ((-far, y), (far, far)), ((-far, -y), (-x, y)), ((x, -y), (far, y))):
         if high[0] <= low[0] or high[1] <= low[1]:
             continue  # the floor extends this far
         texels = ground.width / (2 * far)

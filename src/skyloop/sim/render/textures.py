@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyloop.errors import UnknownNameError
-from skyloop.sim.render.quads import AtlasBuilder, Texture, cv2
+from skyloop.sim.render.quads import AtlasBuilder, Image, Texture, cv2
 
 Gray = NDArray[np.float32]
 
@@ -54,7 +54,6 @@ def finished(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 Rng = np.random.Generator
-Picture = NDArray[np.uint8]
 
 
 def _planks(height: int, width: int, rng: Rng, planks: int, colour: tuple[float, float, float]) -> NDArray[np.float32]:
@@ -66,7 +65,7 @@ def _planks(height: int, width: int, rng: Rng, planks: int, colour: tuple[float,
     return tinted(colour, light * (1.0 - 0.5 * np.clip(1.6 - seam, 0.0, 1.0))[:, None], height, width)
 
 
-def _crate(height: int, width: int, rng: Rng) -> Picture:
+def _crate(height: int, width: int, rng: Rng) -> Image:
     picture = _planks(height, width, rng, 6, (76, 124, 172)) * 0.82
     rim = max(3, round(0.11 * min(height, width)))
     brace = np.zeros((height, width), np.uint8)
@@ -88,7 +87,7 @@ def _crate(height: int, width: int, rng: Rng) -> Picture:
     return result
 
 
-def _door(height: int, width: int, rng: Rng) -> Picture:
+def _door(height: int, width: int, rng: Rng) -> Image:
     light = 1.0 + 0.05 * clouds(rng, height, width, max(2.0, width / 40), height / 2)
     picture = finished(tinted((96, 122, 140), light + 0.015 * grain(rng, height, width), height, width))
     edge = max(2, width // 16)
@@ -101,14 +100,14 @@ def _door(height: int, width: int, rng: Rng) -> Picture:
     return picture
 
 
-def _sky(height: int, width: int, rng: Rng, low: tuple[int, int, int], high: tuple[int, int, int]) -> Picture:
+def _sky(height: int, width: int, rng: Rng, low: tuple[int, int, int], high: tuple[int, int, int]) -> Image:
     down = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
     picture = np.array(high, np.float32) * (1.0 - down) + np.array(low, np.float32) * down
     cloud = np.clip(fractal(rng, height, width, width / 3), 0.0, 1.0)[..., None]
     return finished(picture + (245.0 - picture) * cloud * 0.8)
 
 
-def _hill(picture: Picture, rng: Rng, base: float, rise: float, colour: tuple[int, int, int]) -> None:
+def _hill(picture: Image, rng: Rng, base: float, rise: float, colour: tuple[int, int, int]) -> None:
     height, width = picture.shape[:2]
     ridge = base + rise * clouds(rng, 2, width, width / 5)[0] + 0.25 * rise * clouds(rng, 2, width, width / 22)[0]
     points = np.column_stack([np.arange(width), np.clip(ridge, 0.0, 1.0) * height]).astype(np.int32)
@@ -116,7 +115,7 @@ def _hill(picture: Picture, rng: Rng, base: float, rise: float, colour: tuple[in
     cv2.fillPoly(picture, [outline], colour, cv2.LINE_AA)
 
 
-def _window(height: int, width: int, rng: Rng) -> Picture:
+def _window(height: int, width: int, rng: Rng) -> Image:
     picture = _sky(height, width, rng, (238, 228, 212), (226, 178, 128))
     _hill(picture, rng, 0.70, 0.05, (150, 158, 128))
     _hill(picture, rng, 0.80, 0.06, (84, 128, 92))
@@ -131,7 +130,7 @@ def _window(height: int, width: int, rng: Rng) -> Picture:
     return picture
 
 
-def _poster_landscape(height: int, width: int, rng: Rng) -> Picture:
+def _poster_landscape(height: int, width: int, rng: Rng) -> Image:
     picture = _sky(height, width, rng, (150, 196, 250), (176, 104, 70))
     cv2.circle(picture, (round(0.70 * width), round(0.40 * height)), round(0.09 * height), (190, 236, 255), -1, 16)
     for base, rise, colour in (
@@ -144,7 +143,7 @@ def _poster_landscape(height: int, width: int, rng: Rng) -> Picture:
     return _framed(picture, (40, 44, 48))
 
 
-def _poster_chart(height: int, width: int, rng: Rng) -> Picture:
+def _poster_chart(height: int, width: int, rng: Rng) -> Image:
     picture = np.full((height, width, 3), 246, np.uint8)
     left, right = round(0.12 * width), round(0.92 * width)
     top, bottom = round(0.26 * height), round(0.86 * height)
@@ -167,7 +166,7 @@ def _poster_chart(height: int, width: int, rng: Rng) -> Picture:
     return _framed(picture, (58, 62, 66))
 
 
-def _poster_pattern(height: int, width: int, rng: Rng) -> Picture:
+def _poster_pattern(height: int, width: int, rng: Rng) -> Image:
     picture = np.full((height, width, 3), (208, 222, 230), np.uint8)
     palette = ((58, 70, 208), (196, 132, 40), (52, 168, 242), (96, 156, 74), (128, 70, 122), (48, 44, 42))
     cells = max(3, round(8 * width / max(width, height))), max(3, round(8 * height / max(width, height)))
@@ -186,13 +185,13 @@ def _poster_pattern(height: int, width: int, rng: Rng) -> Picture:
     return _framed(picture, (44, 46, 50))
 
 
-def _framed(picture: Picture, colour: tuple[int, int, int]) -> Picture:
+def _framed(picture: Image, colour: tuple[int, int, int]) -> Image:
     height, width = picture.shape[:2]
     cv2.rectangle(picture, (0, 0), (width - 1, height - 1), colour, max(2, round(0.045 * min(height, width))))
     return picture
 
 
-PICTURES: dict[str, Callable[[int, int, Rng], Picture]] = {
+PICTURES: dict[str, Callable[[int, int, Rng], Image]] = {
     "crate": _crate,
     "door": _door,
     "poster_chart": _poster_chart,
