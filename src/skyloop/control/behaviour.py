@@ -39,9 +39,6 @@ class Behaviour(Controller):
     law needs is unknown, the vehicle hovers and an event reports why.
 
     Subclasses define :meth:`look` and :attr:`phase`, and list phases without sight of the target in :attr:`losses`.
-
-    Attributes:
-        name: Source of the annotations, and prefix of the events' text.
     """
 
     name = "behaviour"  #: source of the annotations, and prefix of the events' text

@@ -197,7 +197,9 @@ class ChaseLaw:
         self._sweep_first = 0.0  # side of the first sweep: 1 for left, 0 if not chosen yet
         self._previous_velocity: tuple[int, Array] | None = None  # time and the target's velocity
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
-        self._response = VelocityResponse(_response(self.settings))
+        self._response = VelocityResponse(
+            ResponseSettings(delay_s=self.settings.lead_s, tilt_rad=self.settings.lean_rad)
+        )
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
         self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and side of the last evasion
@@ -516,10 +518,6 @@ class ChaseLaw:
             forward, left = own.to_body(own.velocity[:2])
             self._limiter.reset(Velocity(forward=forward, left=left))
         self._limiter.limits = limits
-
-
-def _response(settings: ChaseSettings) -> ResponseSettings:
-    return ResponseSettings(delay_s=settings.lead_s, tilt_rad=settings.lean_rad)
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:

@@ -160,7 +160,9 @@ class FlyThroughGates(Behaviour):
         else:
             if isinstance(settings, GateSettings):
                 raise UsageError("a course with a map needs CourseSettings, not GateSettings")
-            self._gate_law = _law_of(course, settings)
+            widths = [gate.inner_size_m[0] for gate in course.gates]
+            wanted = settings or replace(CourseSettings(), map_m=course.map_m)
+            self._gate_law = CourseLaw(course.places, widths, course.poles, course.start, wanted)
             if course.poles and course.pole_colour is not None:
                 self._poles = PoleDetector(course.pole_colour)
         self.passed = 0
@@ -224,9 +226,3 @@ class FlyThroughGates(Behaviour):
             x, y = one.outline[3]
             shapes += [Polyline(one.outline, True, colour), Text(f"{one.distance_m:.2f} m", (x, y + 14.0), colour)]
         return shapes
-
-
-def _law_of(course: Course, settings: CourseSettings | None) -> CourseLaw:
-    settings = settings or replace(CourseSettings(), map_m=course.map_m)
-    widths = [gate.inner_size_m[0] for gate in course.gates]
-    return CourseLaw(course.places, widths, course.poles, course.start, settings)

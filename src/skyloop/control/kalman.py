@@ -239,7 +239,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from measured positions (3,), each with one deviation greater than 0."""
+    """Estimates a point's motion in levelled axes from positions (3,), each with one deviation greater than 0."""
 
     def __init__(
         self,

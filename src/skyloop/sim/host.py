@@ -56,6 +56,7 @@ class SimHost:
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
         """Load the world and place the drones in it."""
+        self.drones = drones
         self.options = options or SimOptions()  #: options of the world and its drones
         world = self.options.load_world()
         self.wind = self.options.blowing(world.wind)  #: the current wind
@@ -69,13 +70,9 @@ class SimHost:
         )
         self.stepping = threading.Lock()  #: held by the stepping thread: an ending one may still be in a step
         self._lock = threading.Lock()
-        self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never modified
+        #: Observers and cameras by drone; replaced as a whole, never modified.
+        self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
         self._stepper: Stepper | None = None
-
-    @property
-    def drones(self) -> int:
-        """Number of drones."""
-        return self.simulation.drones
 
     def set_wind(self, wind: Wind) -> None:
         """Change the wind for all drones."""
@@ -91,10 +88,10 @@ class SimHost:
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
-            if drone in self._observers:
+            if drone in self.observers:
                 raise UsageError(f"drone {drone} of this world is taken already")
             cameras = self._cameras(drone, screen, models)
-            self._observers = {**self._observers, drone: (observer, cameras)}
+            self.observers = {**self.observers, drone: (observer, cameras)}
             if self._stepper is None:
                 self._stepper = self._make_stepper()
             return cameras
@@ -105,23 +102,18 @@ class SimHost:
         No report is running when this returns.
         """
         with self._lock:
-            entry = self._observers.get(drone)
+            entry = self.observers.get(drone)
             stepper = self._stepper
             if entry is None or entry[0] is not observer or stepper is None:
                 return
-            self._observers = {n: other for n, other in self._observers.items() if n != drone}
-            last = not self._observers
+            self.observers = {n: other for n, other in self.observers.items() if n != drone}
+            last = not self.observers
             if last:
                 self._stepper = None
         if last:
             stepper.stop()
         else:
             stepper.forget(entry[1])
-
-    @property
-    def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
-        """Observers and cameras by drone."""
-        return self._observers
 
     def _make_stepper(self) -> Stepper:
         return _RealTimeStepper(self)
