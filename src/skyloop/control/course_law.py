@@ -182,8 +182,8 @@ class CourseLaw(VelocityLaw):
             return
         ahead, rise = ray[:2] / level, float(ray[2]) / level
         sightings = [spot.sighting(motion.position, ahead, rise) for spot in self._poles]
-        nearest = min(range(len(sightings)), key=lambda number: sightings[number].deviations)
-        if sightings[nearest].deviations < _SURE:
+        nearest = min(range(len(sightings)), key=lambda number: sightings[number][0])
+        if sightings[nearest][0] < _SURE:
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:
@@ -349,10 +349,8 @@ class CourseLaw(VelocityLaw):
         ]
 
 
-class _Sighting(NamedTuple):
-    miss: Array  #: offset from the pole's estimated position, (2,) [m]
-    noise: Array  #: covariance of the sighting, (2, 2) [m²]
-    deviations: float  #: the offset in standard deviations
+#: Offset in standard deviations, offset from the pole's estimated position, (2,) [m], and its noise, (2, 2) [m²].
+_Sighting = tuple[float, Array, Array]
 
 
 class _Spot:
@@ -374,17 +372,18 @@ class _Spot:
         """Compare the bearing and slope of a pole's top with this estimate: a higher top is closer."""
         height = self._height - float(own[2])
         if rise * height <= 0.01 or abs(height) < 0.2:
-            return _Sighting(np.zeros(2), np.eye(2), math.inf)
+            return math.inf, np.zeros(2), np.eye(2)
         distance = height / rise
         aside = np.array([-ahead[1], ahead[0]])
         along_m = 0.05 + _TILT_RAD * (distance**2 + height**2) / abs(height)
         noise = np.outer(ahead, ahead) * along_m**2 + np.outer(aside, aside) * (0.03 + 0.02 * distance) ** 2
         miss, spread = own[:2] + distance * ahead - self.place, self._covariance + noise
         off = float(miss @ np.linalg.solve(spread, miss)) ** 0.5
-        return _Sighting(miss, noise * _REPEATED**2, off)
+        return off, miss, noise * _REPEATED**2
 
     def update(self, sighting: _Sighting) -> None:
-        self.place, known = corrected(self.place, self._covariance, sighting.miss, np.eye(2), sighting.noise)
+        _, miss, noise = sighting
+        self.place, known = corrected(self.place, self._covariance, miss, np.eye(2), noise)
         # The odometry drifts, so keep the variance from vanishing.
         self._covariance = known + np.eye(2) * 1e-5
 

@@ -6,6 +6,7 @@ import heapq
 import itertools
 import math
 import threading
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -30,16 +31,6 @@ class Screen(Protocol):
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
 
     def failed(self, error: Exception) -> None: ...
-
-
-class Exposing(Protocol):
-    """Renders exposures and delivers the frames when they are due."""
-
-    def expose(self, exposures: list[Exposure]) -> None: ...
-
-    def forget(self, cameras: tuple[Camera, ...]) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 class Shutter:
@@ -102,13 +93,21 @@ class Exposure:
     due_ns: int  #: time at which to deliver the frame
 
 
-class _Frames:
-    """Rendered frames, each delivered when it is due."""
+class Pipeline(ABC):
+    """Renders exposures and delivers each frame when it is due."""
 
     def __init__(self) -> None:
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
         self._order = itertools.count()
         self._handing = threading.RLock()
+
+    @abstractmethod
+    def expose(self, exposures: list[Exposure]) -> None:
+        """Render exposures."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End. Undelivered frames are lost."""
 
     def hand_out(self, now_ns: int) -> None:
         """Deliver the frames that are due by now."""
@@ -130,7 +129,7 @@ class _Frames:
         heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
 
 
-class CameraPipeline(_Frames):
+class CameraPipeline(Pipeline):
     """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
     Creating the scene takes some tenths of a second, so start the pipeline when the first frame is requested.
@@ -199,7 +198,7 @@ class CameraPipeline(_Frames):
                     self._changed.wait(wait_s)
 
 
-class SteppedCameraPipeline(_Frames):
+class SteppedCameraPipeline(Pipeline):
     """Renders each exposure immediately and delivers due frames on request, all on one thread.
 
     Intended for a world whose time advances only in explicit steps.

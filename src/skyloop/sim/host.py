@@ -19,7 +19,7 @@ from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.camera_pipeline import Camera, Exposing, Screen
+    from skyloop.sim.camera_pipeline import Camera, Pipeline, Screen
 
 TICK_S: Final = 0.008  #: simulated time per batch of steps
 
@@ -144,9 +144,9 @@ class Stepper(Protocol):
 class ReportPublisher:
     """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
 
-    def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
+    def __init__(self, host: SimHost, make_pipeline: Callable[[], Pipeline]) -> None:
         """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""
-        self.pipeline: Exposing | None = None  #: created when the first frame is requested
+        self.pipeline: Pipeline | None = None  #: created when the first frame is requested
         self._host = host
         self._make_pipeline = make_pipeline
         self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
@@ -243,7 +243,7 @@ class _RealTimeStepper:
         for drone, (observer, _) in self._host.observers.items():
             observer.happened(Occurrence(OccurrenceKind.SLOW, drone, self._simulation.time_s, text))
 
-    def _start_pipeline(self) -> Exposing:
+    def _start_pipeline(self) -> Pipeline:
         from skyloop.sim.camera_pipeline import CameraPipeline
 
         options = self._host.options

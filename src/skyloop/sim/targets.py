@@ -10,7 +10,6 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,12 +42,7 @@ _TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
 _RING_STEP_RAD = (math.radians(20), math.radians(45))
 
 
-@dataclass(frozen=True, slots=True)
-class _Point:
-    position: Vec3
-    velocity: Vec3
-    yaw: float  # not wrapped
-    walked: float
+_Point = tuple[Vec3, float, float]  # position, yaw (not wrapped), distance walked
 
 
 class TargetTrack:
@@ -68,14 +62,14 @@ class TargetTrack:
             raise UsageError(f"time must be a finite number of at least 0 s, not {time_s!r}")
         index, part = divmod(time_s / GRID_S, 1.0)
         with self._lock:
-            first, second = self._pair(int(index))
-        position = tuple(a + part * (b - a) for a, b in zip(first.position, second.position, strict=True))
-        yaw = wrap_angle(first.yaw + part * (second.yaw - first.yaw))
-        walked = first.walked + part * (second.walked - first.walked)
+            (here, heading, walked), (there, next_heading, next_walked) = self._pair(int(index))
+        position = tuple(a + part * (b - a) for a, b in zip(here, there, strict=True))
+        yaw = wrap_angle(heading + part * (next_heading - heading))
+        walked += part * (next_walked - walked)
         place = (position[0], position[1], position[2])
         # Use the velocity between the points, not at the first one; otherwise a drone on a platform would creep.
-        velocity = vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
-        rate = (second.yaw - first.yaw) / GRID_S
+        velocity = vec3((np.array(there) - np.array(here)) / GRID_S)
+        rate = (next_heading - heading) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
 
     def _pair(self, index: int) -> tuple[_Point, _Point]:
@@ -217,7 +211,7 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
             heading += clamped(wrap_angle(wanted - heading), most)
         walked += 0.0 if last is None else math.dist(position, last)
         last = position
-        yield _Point(position, velocity, heading, walked)
+        yield position, heading, walked
 
 
 def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:

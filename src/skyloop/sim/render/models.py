@@ -290,11 +290,11 @@ _POLE_M = 12.0  # length of the stand's pole, which goes through the floor and i
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
     """Add a marker's card around the origin, in face axes: x right, y up, z along its normal."""
-    drawn = draw_card(pattern)
+    image, uv = draw_card(pattern)
     half = pattern.card_size_m / 2
-    texture = atlas.add(("card", pattern), lambda: drawn.image)
+    texture = atlas.add(("card", pattern), lambda: image)
     edge = pattern.card_size_m
-    builder.rectangle((-half, -half, 0), (edge, 0, 0), (0, edge, 0), texture, priority=priority, uv=drawn.uv)
+    builder.rectangle((-half, -half, 0), (edge, 0, 0), (0, edge, 0), texture, priority=priority, uv=uv)
 
 
 def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
@@ -389,17 +389,8 @@ _CELL = 24  # texels per cell of the marker
 _PAPER = 235
 
 
-@dataclass(frozen=True, slots=True)
-class Card:
-    """An image of a marker."""
-
-    image: NDArray[np.uint8]  #: the image, BGR
-    #: the visible part of the image: left, top, right, bottom in fractional texels
-    uv: tuple[float, float, float, float]
-
-
-def draw_card(pattern: MarkerPattern) -> Card:
-    """Draw a marker with its margin.
+def draw_card(pattern: MarkerPattern) -> tuple[Image, tuple[float, float, float, float]]:
+    """Draw a marker with its margin, BGR; return also the visible left, top, right, bottom in fractional texels.
 
     The black square takes up ``pattern.size_m`` of the card's ``card_size_m``, accurate to a fraction of a texel.
     """
@@ -418,4 +409,4 @@ def draw_card(pattern: MarkerPattern) -> Card:
     ink = np.where(square > 127, _PAPER, 22).astype(np.uint8)
     image = cv2.copyMakeBorder(ink, border, border, border, border, cv2.BORDER_CONSTANT, value=_PAPER)
     start, end = border - margin, border + black + margin
-    return Card(np.repeat(image[..., None], 3, axis=2).astype(np.uint8), (start, start, end, end))
+    return np.repeat(image[..., None], 3, axis=2).astype(np.uint8), (start, start, end, end)

@@ -13,7 +13,6 @@ model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 from typing import Final
@@ -74,7 +73,7 @@ class PlanarRenderer:
         self.quality = quality
         self._compiler = compiler
         self._pictures = 0
-        self._lenses: dict[tuple[object, ...], _Lens] = {}
+        self._painters: dict[tuple[object, ...], Painter] = {}  # by lens
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
@@ -103,34 +102,29 @@ class PlanarRenderer:
             np.copyto(out, whole)
 
     def _draw(self, state: SceneState, pose: CameraPose, model: CameraModel, samples: int, picture: Image) -> None:
-        lens = self._lens(model, samples)
+        painter = self._painter(model, samples)
         posed = self._pose(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
-        shadows = [at for shadow in posed.shadows if (at := placed(shadow, pose, lens.raster.rays)) is not None]
-        self._painter(lens).paint(posed.quads, shown, shadows, pose, picture)
+        shadows = [at for shadow in posed.shadows if (at := placed(shadow, pose, painter.raster.rays)) is not None]
+        painter.paint(posed.quads, shown, shadows, pose, picture)
 
     def _pose(self, state: SceneState) -> Posed:
         if self._posed is None or self._posed[0] is not state:
             self._posed = (state, self.scene.posed(state))
         return self._posed[1]
 
-    def _painter(self, lens: _Lens) -> Painter:
+    def _painter(self, model: CameraModel, samples: int) -> Painter:
+        key = (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
+        painter = self._painters.get(key)
+        if painter is None:
+            painter = self._painters[key] = PlainPainter(Raster.of(model, samples), model, self.scene.atlas)
         self._pictures += 1
-        if not lens.compiled and self._compiler is not None:
+        if self._compiler is not None and not isinstance(painter, CompiledPainter):
             if self._pictures > WORTH_COMPILING:
                 self._compiler.start()
-            kernels = self._compiler.kernels
-            if kernels is not None:
-                lens.painter = CompiledPainter(lens.raster, lens.model, self.scene.atlas, kernels)
-                lens.compiled = True
-        return lens.painter
-
-    def _lens(self, model: CameraModel, samples: int) -> _Lens:
-        key = (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
-        if key not in self._lenses:
-            raster = Raster.of(model, samples)
-            self._lenses[key] = _Lens(model, raster, PlainPainter(raster, model, self.scene.atlas))
-        return self._lenses[key]
+            if (kernels := self._compiler.kernels) is not None:
+                painter = self._painters[key] = CompiledPainter(painter.raster, model, self.scene.atlas, kernels)
+        return painter
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
@@ -143,14 +137,6 @@ def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
 
 def _samples(quality: Quality) -> int:
     return 4 if quality is Quality.SMOOTH else 1
-
-
-@dataclass(slots=True)
-class _Lens:
-    model: CameraModel
-    raster: Raster
-    painter: Painter
-    compiled: bool = False
 
 
 @lru_cache(maxsize=16)
