@@ -20,7 +20,7 @@ from skyloop.cli.app import run
 from skyloop.cli.text import console
 from skyloop.messages import Attitude, FlightState, Takeoff
 from skyloop.sim import STEP_S, Limits, Simulation, VehicleParameters, parse_world
-from skyloop.sim.columns import NUMBERS
+from skyloop.sim.dynamics import NUMBERS
 from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.rotor_dynamics import PLANT_STEP_S, advance, constants_of, rotors_of, spin
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER

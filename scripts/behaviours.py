@@ -35,7 +35,7 @@ from skyloop.control import (
     OrbitMarker,
     course_in,
 )
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingSettings
 from skyloop.messages import Event, EventKind, Feedback, FlightState
 from skyloop.messages.parameter import WORLD, decode_world
 from skyloop.sim.render import use_one_core

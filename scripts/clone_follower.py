@@ -42,7 +42,7 @@ from skyloop.messages.rows import ACTIONS, state_row
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.vision import MarkerDetector
-from skyloop.vision.planar import pixels_of
+from skyloop.vision.lens import pixels_of
 
 TASK = "follow the marker"
 MARKER = 7  # carried around in the simulated room

@@ -1,12 +1,12 @@
 """Identify the flight model of the simulated AR.Drone from recorded pitch steps, judge it, and draw it.
 
-    python scripts/identify_ardrone.py
-    python scripts/identify_ardrone.py --data ../shared/fixtures/ardrone-flights --picture steps.png
+    python -m scripts.identify_ardrone
+    python -m scripts.identify_ardrone --data ../shared/fixtures/ardrone-flights --picture steps.png
 
 The recordings are not part of the project: docs/ardrone-model.md names their source. The parameters, and how the
 drone's own estimate of its speed follows the speed, are fitted to all recordings but one and judged on that one, for
 each in turn. The values in the code, ``AR_DRONE`` in ``skyloop.sim.vehicles`` and ``AR_DRONE_ESTIMATE`` in
-``skyloop.sim.identification``, are fitted to five and judged on three; they are compared with all, beside the default
+``benchmarks.recorded_steps``, are fitted to five and judged on three; they are compared with all, beside the default
 vehicle, and drawn. Figures are RMS over 3 s, and the reported speed 3 s after the step, simulated and recorded. Needs
 scipy and matplotlib (requirements-dev.txt), and some five minutes.
 """
@@ -25,8 +25,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.optimize import least_squares
 
-from skyloop.sim import VehicleParameters
-from skyloop.sim.identification import (
+from benchmarks.recorded_steps import (
     AR_DRONE_ESTIMATE,
     WINDOW_S,
     Recording,
@@ -35,6 +34,7 @@ from skyloop.sim.identification import (
     read_recording,
     replay,
 )
+from skyloop.sim import VehicleParameters
 from skyloop.sim.parameters import Limits
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE

@@ -18,7 +18,7 @@ from benchmarks.paper.marks import (
     WAYPOINTS,
 )
 from skyloop.clock import monotonic_ns
-from skyloop.control.path_following import Waypoints
+from skyloop.control.path_law import Waypoints
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame

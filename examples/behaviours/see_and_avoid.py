@@ -28,9 +28,9 @@ import numpy as np
 
 import skyloop
 from skyloop.clock import seconds
-from skyloop.control.airframe import Array, Part, VelocityLaw
+from skyloop.control.airframe import Part, VelocityLaw
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.limiting import SetpointLimits, clamped
+from skyloop.control.limiting import Array, SetpointLimits, clamped
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Polyline, Text
 from skyloop.messages.geometry import wrap_angle

@@ -808,7 +808,7 @@ def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
 def _one_core() -> Iterator[None]:
     """Limit OpenCV to the calling thread; restore its number of threads afterwards."""
     from skyloop.sim.render import use_one_core
-    from skyloop.sim.render.base import cv2
+    from skyloop.sim.render.quads import cv2
 
     before = cv2.getNumThreads()
     use_one_core()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from skyloop.client import Frame
-from skyloop.control.chase_settings import FollowMode
+from skyloop.control.chase_law import FollowMode
 from skyloop.control.target_follower import FollowStatus
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback, Polyline, Velocity

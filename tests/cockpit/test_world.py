@@ -12,7 +12,7 @@ import pytest
 from skyloop.cockpit.world import view_values, way_values, world_values
 from skyloop.messages import CameraInfo, Capabilities, Feedback, Intrinsics, Parameter, ParameterType, Value
 from skyloop.messages.parameter import MAX_WORLD_TEXT, WORLD, Solid, WorldGeometry, decode_world, encode_world
-from skyloop.sim.geometry import geometry_of
+from skyloop.sim.world import geometry_of
 from skyloop.sim.world_file import load_world, shipped_worlds
 from tests.support.cockpit import FakeDrone, cockpit, fake_fleet
 

@@ -11,7 +11,7 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim import load_world
 from skyloop.sim.camera import FRONT_CAMERA
-from skyloop.sim.labels import target_boxes
+from skyloop.sim.labels import Labeller
 from skyloop.sim.render import Scene, SceneState
 from skyloop.sim.targets import TargetTrack
 
@@ -66,6 +66,6 @@ class Walker:
         turn = rotation_from_euler(*(float(native[f"truth.{axis}"]) for axis in ("roll", "pitch", "yaw")))
         targets = tuple(track.at(float(native["sim.time_s"])) for track in self._tracks)
         scene = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)), targets, 1.0)
-        found = target_boxes(self._scene, scene, FRONT_CAMERA.pose(body, turn), FRONT_CAMERA)
+        found = Labeller(self._scene).boxes(scene, FRONT_CAMERA.pose(body, turn), FRONT_CAMERA)
         x, y, width, height = next(one.box for one in found if one.name == "walker")
         return float(x), float(y), float(width), float(height)

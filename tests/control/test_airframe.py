@@ -13,7 +13,7 @@ from see_and_avoid import AvoidLaw, AvoidPhase
 
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import DRAG_PER_S, Airframe, AirframeLaw, Part, TiltVelocity
-from skyloop.control.chase_settings import FollowMode
+from skyloop.control.chase_law import FollowMode
 from skyloop.control.course_law import CourseLaw, GatePlace
 from skyloop.control.follow import FollowLaw, Mode
 from skyloop.control.gate_law import GateLaw, GatePhase

@@ -27,8 +27,7 @@ from skyloop.control import (
 )
 from skyloop.control.course_law import CourseSettings
 from skyloop.control.gate_law import GatePhase, GateSettings
-from skyloop.control.landing_law import LandingPhase
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingPhase, LandingSettings
 from skyloop.errors import AuthorityError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -42,7 +41,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.sim.camera import BOTTOM_CAMERA
-from skyloop.sim.geometry import geometry_of
+from skyloop.sim.world import geometry_of
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
 from tests.support.scripted_proxy import WAIT_S, flown, scripted

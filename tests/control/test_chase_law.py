@@ -13,8 +13,7 @@ import pytest
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion
-from skyloop.control.chase_law import ChaseLaw
-from skyloop.control.chase_settings import LOSSES, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Value, Velocity

@@ -15,7 +15,7 @@ from skyloop.client import Drone
 from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
-from skyloop.control.chase_settings import FollowMode, TargetPhase
+from skyloop.control.chase_law import FollowMode, TargetPhase
 from skyloop.control.target_estimate import Traits
 from skyloop.control.target_follower import TargetFollower, detections_of
 from skyloop.errors import UnknownNameError, UsageError

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.control.landing_law import LandingLaw, LandingPhase
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import rotation_from_euler

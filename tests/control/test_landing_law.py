@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
-from skyloop.control.landing_law import LandingLaw, LandingPhase, SpiralSearch
-from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings, SpiralSearch
 from skyloop.control.response import ResponseSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity

@@ -10,10 +10,9 @@ import pytest
 
 from benchmarks.tracking_scenes import texture
 from skyloop.clock import nanoseconds
-from skyloop.control.target_estimate import Traits
+from skyloop.control.target_estimate import Camera, Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_range import RangeEstimator
-from skyloop.control.target_view import Camera
 from skyloop.errors import UsageError
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import Box, Image, TrackResult, overlap

@@ -14,10 +14,9 @@ import pytest
 from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
-from skyloop.control.chase_settings import TargetPhase
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
+from skyloop.control.chase_law import TargetPhase
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
-from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
 from skyloop.messages.relayed import Shape
 from skyloop.stepping.rehearsal import rehearse

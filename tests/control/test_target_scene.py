@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
-from skyloop.control.target_estimate import Traits
+from skyloop.control.target_estimate import Camera, Traits
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
-from skyloop.control.target_view import Camera
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import overlap
 from tests.support.target_world import PERIOD_S, Path, box_of, camera_at, noisy, walk

@@ -15,7 +15,7 @@ import pytest
 from follow_truth import FollowReport, FrameTruth, TargetTruth
 from rich.console import Console
 
-from skyloop.control.chase_settings import LOSSES, TargetPhase
+from skyloop.control.chase_law import LOSSES, TargetPhase
 from skyloop.sim import load_world
 from skyloop.sim.labels import TargetBox
 from skyloop.stepping.rehearsal import rehearse

@@ -25,7 +25,7 @@ from skyloop.gym import (
     ReachVectorEnv,
     register,
 )
-from skyloop.gym.envs import OnBoard, _circle
+from skyloop.gym.envs import _circle, on_board
 from skyloop.gym.tasks import FOLLOWED_M, GATES, NEAR_M
 from skyloop.sim.camera import look_at
 
@@ -107,13 +107,13 @@ def test_pictures_have_the_requested_size_and_show_no_other_drone() -> None:
     arena = envs._task.arena
     for drone in range(4):  # each looks across its cell's middle towards its neighbours
         arena.put(drone, np.array([0.0, 0.0, 2.0]), [0.0, math.pi / 2, -math.pi / 2, math.pi][drone])
-    camera = OnBoard(arena, 84)
+    camera = on_board(arena, 84)
     none: list[Any] = []
-    before = camera.draw(0, none)
+    before = camera.aboard(0, none)
     arena.put(1, np.array([-3.0, 0.0, 2.0]), 0.0)
-    assert np.array_equal(camera.draw(0, none), before)
+    assert np.array_equal(camera.aboard(0, none), before)
     arena.put(0, np.array([0.0, 0.0, 2.5]), 0.0)
-    assert not np.array_equal(camera.draw(0, none), before), "its own cell is visible"
+    assert not np.array_equal(camera.aboard(0, none), before), "its own cell is visible"
     for wrong in (15, 513, 84.0, True):
         with pytest.raises(UsageError, match=r"size_px is .* and must be a whole number from 16 to 512"):
             ReachEnv(observe="pixels", size_px=wrong)  # type: ignore[arg-type]

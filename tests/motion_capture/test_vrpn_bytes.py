@@ -23,10 +23,8 @@ from skyloop.motion_capture.vrpn import (
     TYPE_DESCRIPTION,
     Decoder,
     TrackerPose,
-    encode_description,
-    encode_message,
-    encode_pose,
 )
+from tests.motion_capture.vrpn import encode_description, encode_message, encode_pose
 
 #: Written by hand from Format_Of_Protocol.txt.
 GOLDEN_COOKIE: Final = bytes.fromhex("7672706e3a207665722e2030372e333820203000 00000000")

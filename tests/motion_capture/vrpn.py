@@ -19,17 +19,45 @@ from typing import Final
 
 from skyloop.motion_capture.vrpn import (
     COOKIE,
+    HEADER,
+    NAME_LENGTH,
     POS_QUAT,
+    POSE,
     SENDER_DESCRIPTION,
     TYPE_DESCRIPTION,
-    encode_description,
-    encode_pose,
 )
 from tests.motion_capture.moving import BODIES, PERIOD_S, pose
 
 SENDERS: Final = ("VRPN Control", *BODIES)
 TYPES: Final = ("vrpn_Base ping_message", "vrpn_Base pong_message", POS_QUAT)
 APART_M: Final = 10.0  #: distance along x from one sensor to the next
+
+
+def encode_message(sender: int, kind: int, payload: bytes, *, seconds: int = 0, microseconds: int = 0) -> bytes:
+    """Encode a message with its padding. The time is that of the report, since 1970."""
+    head = HEADER.pack(HEADER.size + len(payload), seconds, microseconds, sender, kind, 0)
+    return head + payload + bytes(-len(payload) % 8)
+
+
+def encode_description(kind: int, number: int, name: str) -> bytes:
+    """Encode the name of the sender (``SENDER_DESCRIPTION``) or type (``TYPE_DESCRIPTION``) with this number."""
+    text = name.encode() + b"\0"
+    return encode_message(number, kind, NAME_LENGTH.pack(len(text)) + text)
+
+
+def encode_pose(
+    sender: int,
+    kind: int,
+    sensor: int,
+    position: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float],
+    *,
+    seconds: int = 0,
+    microseconds: int = 0,
+) -> bytes:
+    """Encode a pose, where ``kind`` is the number described as ``vrpn_Tracker Pos_Quat``."""
+    payload = POSE.pack(sensor, sensor, *position, *quaternion)  # the sensor twice, because the reference pads with it
+    return encode_message(sender, kind, payload, seconds=seconds, microseconds=microseconds)
 
 
 def frame(number: int, sensor: int = 0) -> bytes:

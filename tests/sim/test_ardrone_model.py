@@ -12,10 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.errors import FileFormatError, UsageError
-from skyloop.messages import AnyAction, Attitude, Hover, Velocity
-from skyloop.sim import Limits, Simulation, VehicleParameters, Wind
-from skyloop.sim.identification import (
+from benchmarks.recorded_steps import (
     AR_DRONE_ESTIMATE,
     SAMPLE_PERIOD_S,
     Recording,
@@ -26,6 +23,9 @@ from skyloop.sim.identification import (
     replay,
     sample_times,
 )
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.messages import AnyAction, Attitude, Hover, Velocity
+from skyloop.sim import Limits, Simulation, VehicleParameters, Wind
 from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE

@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, Hover, Land, Takeoff, Velocity
-from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Wind, columns, load_world
-from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, few
+from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Wind, dynamics, load_world
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, Fields, few
 from skyloop.sim.reports import Occurrence, VehicleFeedback
 from skyloop.sim.vehicles import AR_DRONE
 from tests.sim.helpers import HALL
@@ -28,7 +28,7 @@ actions = set_points | st.sampled_from([Hover(), Land(), Takeoff(), EmergencySto
 def fly(commands: list[AnyAction], world: str, seed: int, one_by_one: bool) -> Flight:
     """Fly three different vehicles close to one another and to walls, in gusts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(columns, "FEW", 3 if one_by_one else 0)
+        patch.setattr(dynamics, "FEW", 3 if one_by_one else 0)
         simulation = Simulation(
             HALL if world == "hall" else load_world(world),
             3,
@@ -59,7 +59,7 @@ def test_numbers_and_arrays_give_the_same_bits(commands: list[AnyAction], world:
 def test_a_few_drones_are_read_and_written_as_numbers() -> None:
     assert few(1)
     assert not few(100)
-    table = columns.columns(5, 2)
+    table = dynamics.columns(5, 2)
     table[:, 1] = range(5)
     fields = Fields(table, 1, 3)
     assert fields.read[1]() == (1.0, 2.0, 3.0)

@@ -15,7 +15,7 @@ from skyloop.messages import Takeoff, Velocity
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim import OccurrenceKind, Simulation, load_world, parse_world
 from skyloop.sim.camera import CameraModel, CameraPose
-from skyloop.sim.labels import pictures, target_boxes
+from skyloop.sim.labels import Labeller, pictures
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
 from skyloop.sim.render.compiled import Compiler, load_kernels
 from skyloop.sim.render.planar import dimmed
@@ -150,7 +150,7 @@ def test_compiled_people_and_changing_light_are_the_same_bit_by_bit() -> None:
 def test_boxes_give_a_persons_position_and_visible_share() -> None:
     def label(crates: str) -> dict[str, object]:
         world = parse_world(OUTSIDE + PERSON + crates)
-        found = target_boxes(Scene(world, 0), state(world), camera(-3, 0, 0.9), MODEL)
+        found = Labeller(Scene(world, 0)).boxes(state(world), camera(-3, 0, 0.9), MODEL)
         return {box.name: box for box in found}
 
     (free,) = label("").values()

@@ -11,11 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel, CameraPose
-from skyloop.sim.render.base import SceneState
 from skyloop.sim.render.planar import PlanarRenderer, Quality
-from skyloop.sim.render.quads import Atlas, AtlasBuilder, QuadBuilder, Quads, Texture
+from skyloop.sim.render.quads import Atlas, AtlasBuilder, QuadBuilder, Quads, SceneState, Texture
 from skyloop.sim.render.scene import Posed
-from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
+from skyloop.sim.render.shading import DepthBuffer, Grid, visible_quads
 
 PLAIN = replace(FRONT_CAMERA.scaled(0.5), distortion=(0.0,) * 5)
 BENT = FRONT_CAMERA.scaled(0.5)

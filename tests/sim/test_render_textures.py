@@ -52,11 +52,11 @@ def test_each_level_of_a_texture_is_at_its_computed_place_with_its_rim_repeated(
 
 def test_a_marker_card_keeps_fractions_of_a_texel_in_its_margin() -> None:
     pattern = MarkerPattern("DICT_4X4_50", 0, 0.15, 0.0333)
-    card = draw_card(pattern)
-    left, top, right, bottom = card.uv
+    image, uv = draw_card(pattern)
+    left, top, right, bottom = uv
     black = 6 * 24
     assert right - left == pytest.approx(black * pattern.card_size_m / pattern.size_m)
     assert (left, right) == (top, bottom)
     edge = round(left + pattern.margin_m / pattern.size_m * black)
-    assert card.image[edge - 1, edge + 5, 0] > 200
-    assert card.image[edge, edge + 5, 0] < 50
+    assert image[edge - 1, edge + 5, 0] > 200
+    assert image[edge, edge + 5, 0] < 50

@@ -13,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import ARRAYS, NUMBERS, Operations
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, InstrumentParameters, VehicleParameters, with_ideal_sensors
 from skyloop.sim.rotor_dynamics import (
     PLANT_STEP_S,

@@ -23,7 +23,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Wind, columns, load_world, parse_world
+from skyloop.sim import Limits, Simulation, VehicleParameters, VehicleTruth, Wind, dynamics, load_world, parse_world
 from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback
 from skyloop.sim.vehicles import CRAZYFLIE, IRIS, RACER
@@ -230,7 +230,7 @@ Flight = tuple[list[VehicleTruth], list[VehicleFeedback], list[Occurrence]]
 def fly(commands: list[AnyAction], world: str, seed: int, one_by_one: bool) -> Flight:
     """Fly three different vehicles close to one another and to walls, in gusts; a fourth is flown by firmware."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(columns, "FEW", 3 if one_by_one else 0)
+        patch.setattr(dynamics, "FEW", 3 if one_by_one else 0)
         simulation = Simulation(
             HALL if world == "hall" else load_world(world),
             3,

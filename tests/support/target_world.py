@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import Motion, TiltVelocity
-from skyloop.control.chase_law import ChaseLaw
-from skyloop.control.chase_settings import ChaseSettings, FollowMode, TargetPhase
-from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
+from skyloop.control.chase_law import ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import estimator_of
-from skyloop.control.target_view import BoxView, Camera
 from skyloop.messages import Attitude, Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
 from skyloop.sim.camera import FRONT_CAMERA

@@ -15,8 +15,8 @@ from onnx import TensorProto
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 from skyloop.vision import Layout, ObjectDetector, OnnxDetector
-from skyloop.vision.detector_layouts import class_count, decode, grid_places, tell_layout
 from skyloop.vision.object_tracks import suppress
+from skyloop.vision.onnx_detector import class_count, decode, grid_places, tell_layout
 from tests.support.networks import write
 
 W, H = 96, 64

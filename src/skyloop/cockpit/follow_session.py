@@ -17,7 +17,7 @@ from skyloop.cockpit.feeds import call_soon, start_task
 from skyloop.cockpit.place_flight import UP
 from skyloop.cockpit.target_tracker import Follower, FrameKeeper, TargetTracker, TrackReport
 from skyloop.cockpit.telemetry import number, vector
-from skyloop.control.chase_settings import ChaseSettings, FollowMode
+from skyloop.control.chase_law import ChaseSettings, FollowMode
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
 from skyloop.messages import CameraInfo, Failsafe, Feedback, FrameHeader, Value

@@ -215,7 +215,7 @@ def _finder(names: Sequence[str], network: FabricSettings | None) -> Finder:
 
 
 def _geometry(world: str | Path) -> WorldGeometry:
-    from skyloop.sim.geometry import geometry_of
+    from skyloop.sim.world import geometry_of
     from skyloop.sim.world_file import load_world
 
     return geometry_of(load_world(world))

@@ -2,15 +2,24 @@
 
 from skyloop.control.approach import ApproachMarker, LandOnMarker, OrbitMarker, OrbitPlace
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.chase_settings import ChaseSettings, FollowMode
+from skyloop.control.chase_law import ChaseSettings, FollowMode
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.follow import FollowMarker
 from skyloop.control.gates import FIVE_GATES, RACE_GATES, RACE_TRACK, Course, FlyThroughGates, GateKind, course_in
 from skyloop.control.image_servo import FlowHover, ImageServo
 from skyloop.control.onnx_policy import OnnxPolicy, PolicyNetwork, PolicyPhase
 from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polyline, Spline
-from skyloop.control.path_following import FollowPath, TrackingError, Waypoints
-from skyloop.control.path_law import AlongPath, FixedYaw, LookAt, PathLaw, PathSettings, YawMode
+from skyloop.control.path_law import (
+    AlongPath,
+    FixedYaw,
+    FollowPath,
+    LookAt,
+    PathLaw,
+    PathSettings,
+    TrackingError,
+    Waypoints,
+    YawMode,
+)
 from skyloop.control.route import Finding, Look, Photo, Route, RouteCheck, RouteWaypoint, Wait, load_route, save_route
 from skyloop.control.route_law import FlyRoute
 from skyloop.control.target_follower import FollowTarget

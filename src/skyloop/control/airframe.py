@@ -21,14 +21,11 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, within
+from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimiter, SetpointLimits, clamped, within
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
-
-Array = NDArray[np.float64]
 
 STALE_S: Final = 0.5  #: maximum age of a known value; after a longer gap the odometry may have jumped
 #: Drag on a small quadrotor at some metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
@@ -58,21 +55,13 @@ class Part(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """The vehicle's motion at a point in time, in odometry axes.
+    """The vehicle's motion at a point in time, in odometry axes."""
 
-    Attributes:
-        at_ns: Time of the motion on the proxy's clock.
-        position: Shape (3,) [m].
-        velocity: Shape (3,) [m/s].
-        yaw: [rad]
-        yaw_rate: [rad/s]
-    """
-
-    at_ns: int
-    position: Array
-    velocity: Array
-    yaw: float
-    yaw_rate: float
+    at_ns: int  #: time of the motion on the proxy's clock
+    position: Array  #: shape (3,) [m]
+    velocity: Array  #: shape (3,) [m/s]
+    yaw: float  #: [rad]
+    yaw_rate: float  #: [rad/s]
 
     def moved_to(self, at_ns: int) -> Motion:
         """Return the motion extrapolated to another time, by at most 0.3 s forward or back."""

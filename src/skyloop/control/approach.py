@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Literal
 from skyloop.clock import seconds
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.follow import FollowMarker, FollowSettings, Mode
-from skyloop.control.landing_law import LandingLaw, LandingPhase
-from skyloop.control.landing_settings import LandingSettings
-from skyloop.control.limiting import clamped
+from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
+from skyloop.control.limiting import clamped, require_positive
 from skyloop.control.path import Circle
-from skyloop.control.path_following import FollowPath
-from skyloop.control.path_law import AlongPath, LookAt
+from skyloop.control.path_law import AlongPath, FollowPath, LookAt
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import FlightState, Polyline, Severity, Text
@@ -74,7 +72,7 @@ class ApproachMarker(FollowMarker):
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
-        _require_above_0(distance_m=distance_m, near_m=near_m, near_rad=near_rad, hold_s=hold_s)
+        require_positive(distance_m=distance_m, near_m=near_m, near_rad=near_rad, hold_s=hold_s)
         wanted = replace(settings or FollowSettings(aside_rad=0.0), distance_m=distance_m)
         super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
         self._near_m, self._near_rad, self._hold_s = near_m, near_rad, hold_s
@@ -141,7 +139,7 @@ class OrbitMarker(FollowMarker):
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
-        _require_above_0(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
+        require_positive(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
         if reach_rad > 1.1:
             raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1: further aside, the marker is hidden")
         wanted = replace(settings or FollowSettings(aside_rad=0.05), distance_m=radius_m)
@@ -204,12 +202,6 @@ class OrbitPlace(FollowPath):
         circle = Circle(centre, radius_m, laps=laps, speed_m_s=speed_m_s)
         yaw = LookAt(centre[0], centre[1]) if look == "in" else AlongPath(offset=-math.pi / 2)
         super().__init__(drone, circle, yaw=yaw, settings=settings, source=source)
-
-
-def _require_above_0(**values: float) -> None:
-    for name, value in values.items():
-        if not 0.0 < value < math.inf:
-            raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
 
 
 class LandOnMarker(Behaviour):

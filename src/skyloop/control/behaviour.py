@@ -39,12 +39,6 @@ class Behaviour(Controller):
     law needs is unknown, the vehicle hovers and an event reports why.
 
     Subclasses define :meth:`look` and :attr:`phase`, and list phases without sight of the target in :attr:`losses`.
-
-    Attributes:
-        name: Source of the annotations, and prefix of the events' text.
-        done: Whether the behaviour has reached its end.
-        blind: Whether the vehicle hovers because no frames arrive.
-        problem: The missing part of the vehicle's state that makes it hover; empty if nothing is missing.
     """
 
     name = "behaviour"  #: source of the annotations, and prefix of the events' text
@@ -174,15 +168,7 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Look up a camera in the vehicle's capabilities.
-
-    Args:
-        drone: The drone whose capabilities to read.
-        camera: The camera's name; None for the vehicle's first one.
-
-    Raises:
-        UnknownNameError: The vehicle has no camera of this name, or none at all.
-    """
+    """Look up a camera in the vehicle's capabilities by its name, or take the first; UnknownNameError without one."""
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

@@ -187,11 +187,7 @@ class Controller:
 
 
 def misspelt(own: type[Controller]) -> Iterator[str]:
-    """Describe methods whose names look like misspelt callbacks, and controllers without a callback.
-
-    Args:
-        own: The controller's class.
-    """
+    """Describe methods whose names look like misspelt callbacks, and controllers without a callback."""
     theirs = [
         kind for kind in own.__mro__ if issubclass(kind, Controller) and not kind.__module__.startswith("skyloop.")
     ]

@@ -13,18 +13,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, VelocityLaw
 from skyloop.control.gate_law import Axis, GatePhase, Point, Wall, detour
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.estimation import corrected
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
-Array = NDArray[np.float64]
 _SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
 _TILT_RAD = 0.012  # standard deviation of an elevation, from errors of the attitude and of a pole's top in the image
 _REPEATED = 3.0  # factor on the noise, because errors repeat from one sighting to the next
@@ -81,14 +79,7 @@ class CourseSettings:
 
 
 class CourseLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        axis: The vehicle's position in the gate's axes at the last step.
-        way: The points of the route, in odometry axes.
-        stuck: Why the vehicle can't continue; None while it can.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(
         self,
@@ -98,53 +89,41 @@ class CourseLaw(VelocityLaw):
         start: Point = (0.0, 0.0),
         settings: CourseSettings | None = None,
     ) -> None:
-        """Initialise the law.
-
-        Args:
-            gates: Gates in order.
-            widths_m: Widths of the gates' openings.
-            poles: Other obstacles.
-            start: The vehicle's map position at the first feedback; its yaw at that time is the map's.
-            settings: Settings of the law; None for the defaults.
-        """
+        """Initialise the law; ``start`` is the map position, and the map's yaw that at the first feedback."""
         self.settings = s = settings or CourseSettings()
         super().__init__(
             SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),
             Part.VELOCITY,
             Part.HEIGHT,
         )
+        #: Phase, and the vehicle's position in the gate's axes, at the last step.
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
-        self.way: list[Point] = []
-        self.stuck: str | None = None
+        self.way: list[Point] = []  #: the points of the route, in odometry axes
+        self.stuck: str | None = None  #: why the vehicle can't continue; None while it can
         self._gates, self._widths = tuple(gates), tuple(widths_m)
         self._shift = np.array([-start[0], -start[1], 0.0])  # from map axes to odometry axes
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
-        self._number = 0
+        self.number = 0  #: number of the next gate, from 0
         self._lift: float | None = None  # altitude above the ground minus the odometry's height
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
         self._view = 0  # index of the current viewpoint
         self._begin_gate(0)
 
-    @property
-    def number(self) -> int:
-        """Number of the next gate, from 0."""
-        return self._number
-
     def next_gate(self) -> None:
         """Advance to the next gate. The measured position of the last one corrects the others."""
         if self._seen >= self.settings.sightings:
-            learnt = self._gate_at(self._number) - self._nominal(self._number)
+            learnt = self._gate_at(self.number) - self._nominal(self.number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
             for spot in self._poles:
                 spot.move(share * learnt[:2])
             self._shift = self._shift + share * learnt
             self._shift_m = max(0.1, self._shift_m * math.sqrt(1.0 - share))
-        self._begin_gate(self._number + 1)
+        self._begin_gate(self.number + 1)
 
     def _begin_gate(self, number: int) -> None:
-        self._number, self._seen, self._view = number, 0, 0
+        self.number, self._seen, self._view = number, 0, 0
         self.phase, self.way, self._planned_ns, self._waiting_ns = GatePhase.GOING, [], None, None
         self._passing_ns: int | None = None
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.001, speed_m_s=0.02, gate=5.0)
@@ -156,7 +135,7 @@ class CourseLaw(VelocityLaw):
         """Trust the map only as much as at the start, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
-            self._begin_gate(self._number)
+            self._begin_gate(self.number)
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
@@ -168,17 +147,9 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the next gate; ignore it if the gate can't be there.
-
-        Args:
-            position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-            trust: Confidence in the normal, 0 to 1.
-        """
+        """Update with a sighting of the next gate, as in :meth:`GateLaw.see`; ignore it if the gate can't be there."""
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
-        if found is None or self._lift is None or self._number >= len(self._gates):
+        if found is None or self._lift is None or self.number >= len(self._gates):
             return
         motion, to_level = self._motion(captured_ns), found[1]
         distance = float(np.linalg.norm(position))
@@ -192,7 +163,7 @@ class CourseLaw(VelocityLaw):
         middle = motion.position + seen - np.array([*(off * across), 0.0])
         if self._filter.newest is None:
             expected = math.hypot(self.settings.map_m, self._shift_m, 0.05)
-            self._filter.start(self._nominal(self._number), expected, captured_ns)
+            self._filter.start(self._nominal(self.number), expected, captured_ns)
         if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):
             return
         weight = 0.15 * trust / max(1.0, 0.4 * distance)
@@ -201,13 +172,7 @@ class CourseLaw(VelocityLaw):
         self._seen += 1
 
     def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting of a pole; ignore it if no pole can be there.
-
-        Args:
-            top: Direction of the pole's top in body axes, (3,), of any length.
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-        """
+        """Update with the direction of a pole's top in body axes, (3,); ignore it if no pole can be there."""
         found = self.airframe.at_capture(at_capture, captured_ns, top)
         if found is None or self._lift is None or not self._poles:
             return
@@ -217,8 +182,8 @@ class CourseLaw(VelocityLaw):
             return
         ahead, rise = ray[:2] / level, float(ray[2]) / level
         sightings = [spot.sighting(motion.position, ahead, rise) for spot in self._poles]
-        nearest = min(range(len(sightings)), key=lambda number: sightings[number].deviations)
-        if sightings[nearest].deviations < _SURE:
+        nearest = min(range(len(sightings)), key=lambda number: sightings[number][0])
+        if sightings[nearest][0] < _SURE:
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:
@@ -231,16 +196,16 @@ class CourseLaw(VelocityLaw):
         return place
 
     def _gate_at(self, number: int) -> Array:
-        newest = self._filter.newest if number == self._number else None
+        newest = self._filter.newest if number == self.number else None
         place: Array = self._nominal(number) if newest is None else newest.position
         return place
 
     def _setpoint(self, now_ns: int) -> Array:
         s = self.settings
-        if self._number >= len(self._gates):
+        if self.number >= len(self._gates):
             return np.zeros(4)
         own = self._motion(now_ns).moved_to(now_ns + nanoseconds(s.lead_s))
-        gate, ahead = self._gate_at(self._number), self._heading
+        gate, ahead = self._gate_at(self.number), self._heading
         left = np.array([-ahead[1], ahead[0]])
         offset = own.position - gate
         self.axis = axis = Axis(float(offset[:2] @ ahead), float(offset[:2] @ left), float(offset[2]))
@@ -322,7 +287,7 @@ class CourseLaw(VelocityLaw):
         if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
             return
         self._planned_ns = now_ns
-        gate, ahead = self._gate_at(self._number)[:2], self._heading
+        gate, ahead = self._gate_at(self.number)[:2], self._heading
         here: Point = (float(own.position[0]), float(own.position[1]))
         if self._seen >= s.sightings:
             goals = [gate - ahead * before for before in s.before_m]
@@ -342,7 +307,7 @@ class CourseLaw(VelocityLaw):
 
     def _hides(self, place: Array, gate: Array, ahead: Array) -> bool:
         """Return whether a pole is between a position and the gate's opening."""
-        half = np.array([-ahead[1], ahead[0]]) * (self._widths[self._number] / 2 + self.settings.frame_m)
+        half = np.array([-ahead[1], ahead[0]]) * (self._widths[self.number] / 2 + self.settings.frame_m)
         corners = [place, gate - half, gate + half]
         edges = [
             (b - a) / max(1e-6, float(np.linalg.norm(b - a)))
@@ -366,12 +331,12 @@ class CourseLaw(VelocityLaw):
             middle = self._gate_at(number)[:2]
             along = (
                 self._heading
-                if number == self._number
+                if number == self.number
                 else np.array([math.cos(place.heading_rad), math.sin(place.heading_rad)])
             )
             half = np.array([-along[1], along[0]]) * (width / 2 + s.frame_m / 2)
             (x, y), (u, v) = (middle - half).tolist(), (middle + half).tolist()
-            spread = s.map_m if number != self._number or not self._seen else 0.0
+            spread = s.map_m if number != self.number or not self._seen else 0.0
             walls.append(Wall((x, y), (u, v), s.frame_m / 2 + s.body_m + s.clearance_m + spread))
         return walls
 
@@ -384,10 +349,8 @@ class CourseLaw(VelocityLaw):
         ]
 
 
-class _Sighting(NamedTuple):
-    miss: Array  #: offset from the pole's estimated position, (2,) [m]
-    noise: Array  #: covariance of the sighting, (2, 2) [m²]
-    deviations: float  #: the offset in standard deviations
+#: Offset in standard deviations, offset from the pole's estimated position, (2,) [m], and its noise, (2, 2) [m²].
+_Sighting = tuple[float, Array, Array]
 
 
 class _Spot:
@@ -409,17 +372,18 @@ class _Spot:
         """Compare the bearing and slope of a pole's top with this estimate: a higher top is closer."""
         height = self._height - float(own[2])
         if rise * height <= 0.01 or abs(height) < 0.2:
-            return _Sighting(np.zeros(2), np.eye(2), math.inf)
+            return math.inf, np.zeros(2), np.eye(2)
         distance = height / rise
         aside = np.array([-ahead[1], ahead[0]])
         along_m = 0.05 + _TILT_RAD * (distance**2 + height**2) / abs(height)
         noise = np.outer(ahead, ahead) * along_m**2 + np.outer(aside, aside) * (0.03 + 0.02 * distance) ** 2
         miss, spread = own[:2] + distance * ahead - self.place, self._covariance + noise
         off = float(miss @ np.linalg.solve(spread, miss)) ** 0.5
-        return _Sighting(miss, noise * _REPEATED**2, off)
+        return off, miss, noise * _REPEATED**2
 
     def update(self, sighting: _Sighting) -> None:
-        self.place, known = corrected(self.place, self._covariance, sighting.miss, np.eye(2), sighting.noise)
+        _, miss, noise = sighting
+        self.place, known = corrected(self.place, self._covariance, miss, np.eye(2), noise)
         # The odometry drifts, so keep the variance from vanishing.
         self._covariance = known + np.eye(2) * 1e-5
 

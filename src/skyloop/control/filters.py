@@ -77,9 +77,6 @@ class Complementary:
     The rate passes a high pass and the angle a low pass with the same time constant; the two add up to one (Higgins, "A
     Comparison of Complementary and Kalman Filtering", IEEE Trans. AES 11(3), 1975). Angles [rad] are wrapped, so that
     crossing ±π counts as a small step.
-
-    Attributes:
-        angle: The filtered angle in [-π, π); None before the first measurement.
     """
 
     def __init__(self, time_constant_s: float, angle: float | None = None) -> None:

@@ -15,13 +15,12 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, TurningSearch, VelocityLaw
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened, within
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.messages import Feedback, Points, Polyline, Text
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.relayed import Colour, Shape
@@ -29,8 +28,6 @@ from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
-
-Array = NDArray[np.float64]
 
 
 class Mode(StrEnum):
@@ -67,25 +64,17 @@ class FollowSettings:
 
 
 class FollowLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        mode: Phase at the last step.
-        station_rad: Wanted angle around the marker from its normal, counter-clockwise as seen from above.
-        station_rate_rad_s: Rate of that angle.
-        off_m: Combined error of distance and height at the last step; None while searching.
-        aside_rad: The vehicle's actual angle, measured like ``station_rad``; None while the marker's normal is unknown.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
         """Initialise the law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
-        self.mode = Mode.SEARCHING
+        self.mode = Mode.SEARCHING  #: phase at the last step
         #: Wanted angle around the marker from its normal, counter-clockwise from above [rad], and its rate [rad/s].
         self.station_rad = 0.0
-        self.station_rate_rad_s = 0.0
+        self.station_rate_rad_s = 0.0  #: rate of that angle
         self.off_m: float | None = None  #: error of distance and height at the last step; None while searching
         self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
         self._target = TargetFilter()
@@ -100,12 +89,8 @@ class FollowLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting; ignore it if the vehicle's attitude or motion is unknown.
 
-        Args:
-            position: The marker's centre in body axes at the time of capture, (3,) [m].
-            normal: Normal of the marker's face in the same axes, (3,).
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-            trust: Confidence in the normal, 0 to 1.
+        The marker's centre, (3,) [m], and its face's normal are in body axes at the capture time, whose attitude is
+        that of ``at_capture``. ``trust`` is the confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
@@ -182,15 +167,10 @@ class TargetFilter:
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        """Update with a measured position; ignore it if it is older than the last one.
+        """Update with a measured position (3,) [m] of a standard deviation; ignore it if it is older than the last one.
 
         The filter restarts after two seconds without a sighting, or if the target is more than a metre (and five
         standard deviations) away from its prediction.
-
-        Args:
-            position: Shape (3,) [m].
-            deviation_m: Standard deviation of each component.
-            at_ns: Time of the measurement.
         """
         newest = self._filter.newest
         if newest is None or self._jumped(position, deviation_m, at_ns):
@@ -199,18 +179,7 @@ class TargetFilter:
             self._filter.update(position, deviation_m, at_ns)
 
     def at(self, at_ns: int, *, longest_s: float = 1.0) -> tuple[Array, Array]:
-        """Predict the target's motion.
-
-        Args:
-            at_ns: The time to predict for.
-            longest_s: Maximum time to extrapolate the last estimate.
-
-        Returns:
-            Position (3,) [m] and velocity (3,) [m/s].
-
-        Raises:
-            UsageError: The target has never been seen.
-        """
+        """Predict the target's position (3,) [m] and velocity (3,) [m/s]; UsageError if it was never seen."""
         estimate = self._filter.at(at_ns, longest_s=longest_s)
         return estimate.position, estimate.velocity
 
@@ -251,12 +220,7 @@ class FollowScore:
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
     def count(self, captured_ns: int, range_error_m: float | None) -> None:
-        """Count a frame.
-
-        Args:
-            captured_ns: Capture time of the frame.
-            range_error_m: Estimated minus wanted distance; None if the frame did not show the marker.
-        """
+        """Count a frame, with the estimated minus the wanted distance; None if it did not show the marker."""
         if range_error_m is not None:
             if self.first_seen_ns is None:
                 self.first_seen_ns = captured_ns

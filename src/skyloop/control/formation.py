@@ -24,17 +24,11 @@ MOST: Final = 200  #: maximum number of positions for :func:`assign`
 
 
 class Approach(NamedTuple):
-    """The closest approach between any two of several drones.
-
-    Attributes:
-        distance_m: Distance between the two closest drones; infinite if there are fewer than two.
-        first: Index of one of the two drones.
-        second: Index of the other one.
-    """
+    """The closest approach between any two of several drones."""
 
     distance_m: float  #: infinite if there are fewer than two drones
-    first: int
-    second: int
+    first: int  #: index of one of the two drones
+    second: int  #: index of the other one
 
 
 def line(n: int, spacing_m: float) -> Places:

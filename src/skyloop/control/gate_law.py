@@ -21,16 +21,14 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Part, TurningSearch, VelocityLaw
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import SetpointLimits, clamped, shortened
+from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import wrap_angle
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]
 
 _AROUND = 8  # number of graph points around each end of a wall
@@ -89,30 +87,21 @@ class Axis(NamedTuple):
 
 
 class GateLaw(VelocityLaw):
-    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        axis: The vehicle's position at the last step; None while the gate's position is unknown.
-    """
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: GateSettings | None = None) -> None:
         """Initialise the law."""
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
-        self.phase = GatePhase.SEARCHING
-        self.axis: Axis | None = None  #: the vehicle's position at the last step
+        self.phase = GatePhase.SEARCHING  #: phase at the last step
+        self.axis: Axis | None = None  #: the vehicle's position at the last step; None while the gate's is unknown
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._gate = _new_filter()
         self._way: Array | None = None  # direction through the gate, horizontal unit vector
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
-        """Forget the gate and search for the next one.
-
-        Args:
-            turning: Direction to search first; positive is counter-clockwise.
-        """
+        """Forget the gate and search for the next one, turning first counter-clockwise if ``turning`` is positive."""
         self.phase = GatePhase.SEARCHING
         self.forget()
         self._search.restart(turning=turning)
@@ -127,13 +116,8 @@ class GateLaw(VelocityLaw):
         """Update with a sighting.
 
         It is ignored if the vehicle's attitude or motion is unknown, or if it is far from the gate's earlier sightings.
-
-        Args:
-            position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
-            trust: Confidence in the normal, 0 to 1.
+        The opening's centre, (3,) [m], and the visible side's normal are in body axes at the capture time, whose
+        attitude is that of ``at_capture``. ``trust`` is the confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
@@ -224,12 +208,8 @@ class Wall(NamedTuple):
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
     """Return the points of the shortest way, excluding the start but including the goal; None if there is no way.
 
-    The start or goal may be too close to a wall, but the way comes no closer to that wall.
-
-    Args:
-        start: East, north [m].
-        goal: East, north [m].
-        walls: Obstacles, at most a few dozen, because the effort grows with the cube of their number.
+    The start or goal may be too close to a wall, but the way comes no closer to that wall. Points are east, north [m].
+    At most a few dozen walls, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)

@@ -19,10 +19,7 @@ from skyloop.vision import GateDetector, GateSighting, PoleDetector
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-_COLOURS: dict[GatePhase, Colour] = {
-    GatePhase.SEARCHING: (120, 190, 255),
-    GatePhase.RECOVERING: (255, 180, 60),
-}
+_COLOURS: dict[GatePhase, Colour] = {GatePhase.SEARCHING: (120, 190, 255), GatePhase.RECOVERING: (255, 180, 60)}
 _SEEN: Colour = (64, 220, 100)
 
 
@@ -48,23 +45,15 @@ FIVE_GATES = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention.
+    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention."""
 
-    Attributes:
-        gates: Gates in order.
-        places: Positions of the gates.
-        poles: Other obstacles.
-        pole_colour: Red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour.
-        start: Take-off position, x and y.
-        map_m: Standard deviation of the positions [m].
-    """
-
-    gates: tuple[GateKind, ...]
-    places: tuple[GatePlace, ...]
-    poles: tuple[Pole, ...] = ()
+    gates: tuple[GateKind, ...]  #: gates in order
+    places: tuple[GatePlace, ...]  #: positions of the gates
+    poles: tuple[Pole, ...] = ()  #: other obstacles
+    #: red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour
     pole_colour: tuple[int, int, int] | None = None
-    start: tuple[float, float] = (0.0, 0.0)
-    map_m: float = 0.05
+    start: tuple[float, float] = (0.0, 0.0)  #: take-off position, x and y
+    map_m: float = 0.05  #: standard deviation of the positions [m]
 
     def __post_init__(self) -> None:
         if len(self.gates) != len(self.places):
@@ -171,7 +160,9 @@ class FlyThroughGates(Behaviour):
         else:
             if isinstance(settings, GateSettings):
                 raise UsageError("a course with a map needs CourseSettings, not GateSettings")
-            self._gate_law = _law_of(course, settings)
+            widths = [gate.inner_size_m[0] for gate in course.gates]
+            wanted = settings or replace(CourseSettings(), map_m=course.map_m)
+            self._gate_law = CourseLaw(course.places, widths, course.poles, course.start, wanted)
             if course.poles and course.pole_colour is not None:
                 self._poles = PoleDetector(course.pole_colour)
         self.passed = 0
@@ -235,9 +226,3 @@ class FlyThroughGates(Behaviour):
             x, y = one.outline[3]
             shapes += [Polyline(one.outline, True, colour), Text(f"{one.distance_m:.2f} m", (x, y + 14.0), colour)]
         return shapes
-
-
-def _law_of(course: Course, settings: CourseSettings | None) -> CourseLaw:
-    settings = settings or replace(CourseSettings(), map_m=course.map_m)
-    widths = [gate.inner_size_m[0] for gate in course.gates]
-    return CourseLaw(course.places, widths, course.poles, course.start, settings)

@@ -1,30 +1,35 @@
 """Behaviours that hold a position by images alone: in front of a marker, or over the ground without other positioning.
 
-The marker is approached by image-based visual servoing (:mod:`skyloop.control.interaction`). Over the ground, optical
-flow measures the drift, and attitude set-points counteract it.
+The marker is approached by image-based visual servoing. The method is that of Chaumette and Hutchinson, "Visual servo
+control, part I: basic approaches", IEEE Robotics & Automation Magazine 13(4), 2006, whose equation numbers are given
+below. Camera axes are optical: x right, y down, z forward. Points are the intersections of their rays with the plane at
+z = 1, shape (n, 2). A multirotor must tilt to fly, which shifts even fixed points in the image. Points are therefore
+first converted to the image of a *virtual level camera* that has the vehicle's yaw but not its roll and pitch (Jabbari,
+Oriolo and Bolandi, "An adaptive scheme for image-based visual servoing of an underactuated UAV", Int. J. Robotics and
+Automation 29(1), 2014), and the twist is restricted to motions of the levelled vehicle: forward, left, up and yaw.
+
+Over the ground, optical flow measures the drift, and attitude set-points counteract it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
-from skyloop.control.interaction import levelled, servo
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimits, clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimits, clamped, require_positive, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import rotation_from_euler, wrap_angle
 from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision import MarkerDetector
@@ -35,7 +40,63 @@ from skyloop.vision.planar import rectangle
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-Array = NDArray[np.float64]
+
+def interaction_matrix(points: Array, depths_m: Array) -> Array:
+    """Return the interaction matrix (2n, 6) of points (n, 2), their image motion per camera twist (equation 11).
+
+    The twist is the camera's velocity [m/s] and angular velocity [rad/s] along and about its own axes, (6,). The rows
+    are x and y of each point in turn.
+    """
+    points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
+        raise UsageError(f"points need shape (n, 2) and depths (n,), got {points.shape} and {depths.shape}")
+    if not (np.isfinite(points).all() and np.isfinite(depths).all() and (depths > 0.0).all()):
+        raise UsageError("points must be finite, and depths above 0")
+    x, y, z, none = points[:, 0], points[:, 1], 1.0 / depths, np.zeros(len(points))
+    along_x = np.column_stack([-z, none, x * z, x * y, -(1.0 + x * x), y])
+    along_y = np.column_stack([none, -z, y * z, 1.0 + y * y, -x * y, -x])
+    return np.stack([along_x, along_y], axis=1).reshape(-1, 6)
+
+
+def camera_twist(camera: CameraInfo) -> Array:
+    """Return the matrix (6, 4) that converts the levelled vehicle's motion to the twist of a level camera.
+
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's position in the body matters, because a
+    camera mounted ahead of the centre swings when the vehicle turns.
+    """
+    to_camera = mounting_rotation(camera).T
+    place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
+    up = np.array([0.0, 0.0, 1.0])
+    twist = np.zeros((6, 4))
+    twist[:3, :3] = to_camera
+    twist[:3, 3] = to_camera @ np.cross(up, place)
+    twist[3:, 3] = to_camera @ up
+    return twist
+
+
+def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
+    """Return points (n, 2) as a level camera would see them; UsageError if one would not be in front of it."""
+    mounting = mounting_rotation(camera)
+    turn = mounting.T @ rotation_from_euler(roll, pitch, 0.0) @ mounting
+    rays = np.column_stack([points, np.ones(len(points))]) @ turn.T
+    if (rays[:, 2] <= 1e-3).any():
+        raise UsageError("a level camera would not see these points: the vehicle is tilted too far")
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
+    """Compute the motion that brings the level camera's points (n, 2) to their wanted positions at an exponential rate.
+
+    The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`): forward, left, up [m/s] and yaw
+    rate [rad/s], (4,). The gain is in 1/s.
+    """
+    if np.shape(points) != np.shape(wanted) or len(points) < 2:
+        raise UsageError(f"servo needs two or more points, and equal shapes: {np.shape(points)}, {np.shape(wanted)}")
+    jacobian = interaction_matrix(points, depths_m) @ camera_twist(camera)
+    error = (np.asarray(points) - np.asarray(wanted)).reshape(-1)
+    return np.asarray(-gain * (np.linalg.pinv(jacobian, rcond=1e-3) @ error))
+
+
 _SEEN: Colour = (64, 220, 100)
 _WANTED: Colour = (255, 210, 60)
 _LOOKING: Colour = (120, 190, 255)
@@ -52,11 +113,7 @@ class ServoPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
-    """Gain and limits of :class:`ImageServoLaw`.
-
-    Raises:
-        UsageError: A number is not finite and greater than 0.
-    """
+    """Gain and limits of :class:`ImageServoLaw`."""
 
     gain: float = 0.8  #: [1/s]
     #: Fraction of the velocity error (if the velocity is known) that is added to the set-point against gusts.
@@ -70,41 +127,23 @@ class ServoSettings:
     search_rad_s: float = 0.7
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        require_positive(**asdict(self))
 
 
 class ImageServoLaw(VelocityLaw):
-    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns].
-
-    Attributes:
-        phase: Phase at the last step.
-        error: Root mean square distance between the points and their wanted positions, in the plane at z = 1.
-    """
+    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns]."""
 
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
     ) -> None:
-        """Initialise the law.
-
-        Args:
-            camera: The camera, including its mounting.
-            wanted: Wanted positions of the points in the level camera, (n, 2) in the plane at z = 1.
-            depth_m: Distance between the points and the camera at the goal.
-            settings: Settings of the law; None for the defaults.
-
-        Raises:
-            UsageError: The camera's mounting is unknown.
-        """
+        """Initialise the law with the points wanted in the level camera, (n, 2) at z = 1, and their depth there."""
         mounting_rotation(camera)  # raises here rather than in flight
         s = self.settings = settings or ServoSettings()
         limits = SetpointLimits(
             s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0
         )
         super().__init__(limits, Part.ATTITUDE)
-        self.phase = ServoPhase.SEARCHING
+        self.phase = ServoPhase.SEARCHING  #: phase at the last step
         self.error = math.inf  #: RMS distance between the points and their wanted positions, plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
@@ -114,15 +153,10 @@ class ImageServoLaw(VelocityLaw):
         self._search = TurningSearch(s.search_rad_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the points from a frame.
+        """Update with the points (n, 2) from a frame as the camera saw them, in the plane at z = 1.
 
         They are ignored, as if nothing were seen, if the attitude is unknown or the vehicle is tilted so far that a
         level camera would not see them. The depth of all points is estimated from their apparent size.
-
-        Args:
-            points: The points as the camera saw them, (n, 2) in the plane at z = 1.
-            at_capture: Feedback with the attitude at the time of capture.
-            captured_ns: Capture time of the frame.
         """
         self.airframe.add(at_capture)
         roll, pitch = at_capture.roll_rad, at_capture.pitch_rad
@@ -194,8 +228,7 @@ class ImageServo(Behaviour):
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
-        if not 0.0 < distance_m < math.inf:
-            raise UsageError(f"distance_m is {distance_m!r} and must be a finite number above 0")
+        require_positive(distance_m=distance_m)
         info = camera_info(drone, camera)
         if mounting_rotation(info)[0, 2] < 0.5:
             raise UsageError(f"camera {info.name!r} does not look forward")
@@ -249,11 +282,7 @@ class FlowPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
-    """Gains and limits of :class:`FlowLaw`.
-
-    Raises:
-        UsageError: A number is negative or not finite.
-    """
+    """Gains and limits of :class:`FlowLaw`."""
 
     gain: float = 2.5  #: acceleration per distance [1/s²]
     damping: float = 2.6  #: acceleration per velocity [1/s]
@@ -265,10 +294,7 @@ class FlowSettings:
     fresh_s: float = 0.3  #: time to continue without sight of the ground
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        require_positive(self.__dataclass_fields__, **asdict(self))
 
 
 @dataclass(slots=True)
@@ -285,17 +311,13 @@ class FlowLaw(AirframeLaw):
 
     There is one PID controller per axis: acceleration from the position, its integral and the velocity. The velocity
     comes from a constant-velocity filter over the positions, not from the vehicle.
-
-    Attributes:
-        phase: Phase at the last step.
-        off_m: Estimated distance from the position to hold; None if unknown.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
         """Initialise the law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
-        self.phase = FlowPhase.WAITING
+        self.phase = FlowPhase.WAITING  #: phase at the last step
         self.off_m: float | None = None  #: estimated distance from the position to hold; None if unknown
         self._loop = VectorPi(Gains(p=s.gain, i=s.integral), 2, most=0.5 * s.tilt_rad * GRAVITY_M_S2)
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
@@ -308,11 +330,9 @@ class FlowLaw(AirframeLaw):
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position. The first one, or the first after a second without any, becomes the position to hold.
+        """Update with a position at a capture time, (2,) [m], along yaw 0 and to its left.
 
-        Args:
-            place: The vehicle's position at the time of capture, (2,) [m], along yaw 0 and to its left.
-            captured_ns: Capture time of the frame.
+        The first one, or the first after a second without any, becomes the position to hold.
         """
         newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():

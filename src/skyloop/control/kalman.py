@@ -16,14 +16,12 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.limiting import within
+from skyloop.control.limiting import Array, require_positive, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
-Array = NDArray[np.float64]
 #: Added to an innovation's variance so that a nearly exact state does not cause a division by zero.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
@@ -52,23 +50,14 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnEstimate:
-    """A point's motion at a time.
-
-    Attributes:
-        at_ns: Time of the estimate.
-        position: Position, (3,) [m].
-        velocity: Velocity, (3,) [m/s].
-        turn_rate: Turn rate of the horizontal velocity, counter-clockwise from above [rad/s].
-        extra: Horizontal acceleration in addition to the turn's, (2,) [m/s²].
-        covariance: Covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
-    """
+    """A point's motion at a time."""
 
     at_ns: int
-    position: Array
-    velocity: Array
-    turn_rate: float
-    extra: Array
-    covariance: Array
+    position: Array  #: position, (3,) [m]
+    velocity: Array  #: velocity, (3,) [m/s]
+    turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise from above [rad/s]
+    extra: Array  #: horizontal acceleration in addition to the turn's, (2,) [m/s²]
+    covariance: Array  #: covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7)
 
     @property
     def acceleration(self) -> Array:
@@ -97,16 +86,10 @@ _E = TypeVar("_E", Estimate, TurnEstimate)
 
 
 class _Filter(ABC, Generic[_E]):
-    """The common base class of both filters.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """The common base class of both filters."""
 
     def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
-        for name, value in finite.items():
-            if not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        require_positive(finite, **finite)
         if not gate > 0.0:
             raise UsageError(f"gate is {gate!r} and must be above 0")
         self._n, self._gate = dimensions, gate
@@ -206,19 +189,10 @@ class _Filter(ABC, Generic[_E]):
 
 
 class ConstantVelocityFilter(_Filter[Estimate]):
-    """A Kalman filter for a point that moves at constant velocity with random accelerations.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """A Kalman filter for a point that moves at constant velocity with random accelerations."""
 
     def __init__(
-        self,
-        dimensions: int = 3,
-        *,
-        intensity_m2_s3: float = 0.05,
-        speed_m_s: float = 0.7,
-        gate: float = 5.0,
+        self, dimensions: int = 3, *, intensity_m2_s3: float = 0.05, speed_m_s: float = 0.7, gate: float = 5.0
     ) -> None:
         """Initialise the filter.
 
@@ -265,11 +239,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from measured positions (3,), each with one deviation greater than 0.
-
-    Attributes:
-        refused: Number of measurements outside the gate since the last one inside it.
-    """
+    """Estimates a point's motion in levelled axes from positions (3,), each with one deviation greater than 0."""
 
     def __init__(
         self,
@@ -305,8 +275,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
             turn_wander_rad_s=turn_wander_rad_s,
             extra_m_s2=extra_m_s2,
         )
-        if not 0.0 < extra_s < math.inf:
-            raise UsageError(f"extra_s is {extra_s!r} and must be a finite number above 0")
+        require_positive(extra_s=extra_s)
         self._intensity = intensity_m2_s3
         first = [0.0, 0.0, speed_m_s, speed_m_s, turn_rad_s, extra_m_s2, extra_m_s2]
         self._first = np.diag(np.square(first))

@@ -6,7 +6,7 @@ NaN never passes: it counts as 0 or as the number nearest to 0 in the range.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +64,14 @@ class SetpointLimits:
             value = getattr(self, name)
             if not value > 0.0:
                 raise UsageError(f"{name} is {value!r} and must be above 0")
+
+
+def require_positive(zero: Container[str] = (), **values: float) -> None:
+    """Raise UsageError for a value that is not a finite number above 0, or at least 0 if its name is in ``zero``."""
+    for name, value in values.items():
+        if not (0.0 < value < math.inf or (value == 0.0 and name in zero)):
+            allowed = "a finite number, 0 or more" if name in zero else "a finite number above 0"
+            raise UsageError(f"{name} is {value!r} and must be {allowed}")
 
 
 class SetpointLimiter:

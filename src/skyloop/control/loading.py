@@ -24,19 +24,10 @@ Stamp = tuple[int, int, int]  #: value that changes when a file is saved: time [
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """Load the controller class from a Python file.
+    """Load the controller class from a Python file, by its name in case the file has several.
 
     The file is executed and can import modules next to it, as a script can. Imported classes count only if the file
-    itself defines no controller.
-
-    Args:
-        path: The Python file.
-        class_name: Name of the class, in case the file has several.
-
-    Raises:
-        FileFormatError: The file can't be read or executed (with the line), or has no controller.
-        UnknownNameError: The file has no class with that name.
-        UsageError: The file does not exist, or it has several controllers and no name was given.
+    itself defines no controller. FileFormatError names the line that can't be executed.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -115,16 +106,7 @@ def _is(name: str | None, file: Path) -> bool:
 
 
 def load_module(file: Path, what: str) -> ModuleType:
-    """Execute a Python file as a separate module.
-
-    Args:
-        file: The Python file.
-        what: What the file should contain; a noun phrase for the error message.
-
-    Raises:
-        FileFormatError: The file can't be read or executed (with the line).
-        UsageError: The file does not exist, or is a directory.
-    """
+    """Execute a Python file as a separate module; ``what`` it should contain is a noun phrase for the error message."""
     if file.is_dir():
         raise UsageError(f"{file} is a directory: give a Python file in it")
     if not file.exists():
@@ -139,13 +121,7 @@ class Reloader:
     """
 
     def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
-        """Record the state of the files. The thread starts when the context is entered.
-
-        Args:
-            path: The controller's file.
-            class_name: Name of the class, in case the file has several.
-            look_s: Interval at which the files are polled [s].
-        """
+        """Record the state of the files, polled each ``look_s``. The thread starts when the context is entered."""
         self._path = Path(path)
         self._folder = self._path.resolve().parent
         self._class_name = class_name

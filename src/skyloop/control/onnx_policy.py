@@ -20,9 +20,9 @@ from skyloop.extend import let_go
 from skyloop.messages import Attitude, Feedback, Text, Velocity
 from skyloop.messages.relayed import Shape
 from skyloop.messages.rows import ACTIONS, STATE, set_point, state_row
+from skyloop.vision.lens import pixels_of
 from skyloop.vision.onnx import load_network, reason
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import pixels_of
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame

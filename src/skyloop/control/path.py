@@ -12,42 +12,29 @@ import bisect
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from operator import itemgetter
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from skyloop.control.limiting import within
+from skyloop.control.limiting import Array, within
 from skyloop.errors import MissingExtraError, UsageError
 
 #: Shorter stretches are skipped because the squares of their speeds would underflow a float.
 SHORTEST_M: Final = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    begin_s: float
-    begin_m: float
-    speed: float
-    acceleration: float
-
-
 class MotionProfile:
     """Distance and speed over time, from rest to rest."""
 
     def __init__(self, stretches: Sequence[tuple[float, float]], acceleration_m_s2: float) -> None:
-        """Compute the profile.
+        """Compute the profile from the length [m] and maximum speed [m/s] of each stretch.
 
-        Args:
-            stretches: Length [m] and maximum speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches of
-                at most :data:`SHORTEST_M` take no time.
-            acceleration_m_s2: Acceleration and deceleration; greater than 0.
-
-        Raises:
-            UsageError: A stretch would never end because its speed limit is 0.
+        Speed 0 with length 0 is a stop. Stretches of at most :data:`SHORTEST_M` take no time.
         """
-        self._pieces: list[_Piece] = []
+        #: Start [s, m], speed and acceleration of each piece.
+        self._pieces: list[tuple[float, float, float, float]] = []
         self.duration_s = 0.0  #: duration of the whole profile
         self.length_m = 0.0  #: length of the whole profile
         joints = _joint_speeds(stretches, acceleration_m_s2)
@@ -60,10 +47,11 @@ class MotionProfile:
             return 0.0, 0.0
         if t_s >= self.duration_s:
             return self.length_m, 0.0
-        piece = self._pieces[bisect.bisect_right(self._pieces, t_s, key=lambda one: one.begin_s) - 1]
-        dt = t_s - piece.begin_s
-        way = piece.begin_m + piece.speed * dt + piece.acceleration * dt * dt / 2
-        return min(self.length_m, way), max(0.0, piece.speed + piece.acceleration * dt)
+        after = bisect.bisect_right(self._pieces, t_s, key=itemgetter(0))
+        begin_s, begin_m, speed, acceleration = self._pieces[after - 1]
+        dt = t_s - begin_s
+        way = begin_m + speed * dt + acceleration * dt * dt / 2
+        return min(self.length_m, way), max(0.0, speed + acceleration * dt)
 
     def _stretch(self, length: float, limit: float, begin: float, end: float, a: float) -> None:
         if length <= SHORTEST_M:
@@ -79,7 +67,7 @@ class MotionProfile:
 
     def _piece(self, length: float, speed: float, acceleration: float, lasts_s: float) -> None:
         if lasts_s > 0.0:
-            self._pieces.append(_Piece(self.duration_s, self.length_m, speed, acceleration))
+            self._pieces.append((self.duration_s, self.length_m, speed, acceleration))
             self.duration_s += lasts_s
             self.length_m += length
 
@@ -95,7 +83,6 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
     return speeds
 
 
-Array = NDArray[np.float64]
 _DIFFERENCE_S = 0.01  # step of the numerical derivative on either side
 
 #: Lengths, speeds, accelerations and times in this range can be divided without under- or overflow.

@@ -9,17 +9,14 @@ integral grows only as far as later limits let its output through (conditional i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.control.filters import LowPass, gain
-from skyloop.control.limiting import clamped, shortened, within
+from skyloop.control.limiting import Array, clamped, require_positive, shortened, within
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import wrap_angle
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +35,8 @@ class Gains:
     tracking_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("p", "i", "d", "derivative_filter_s", "tracking_s"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 <= value < math.inf:
-                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        require_positive(given, **given)
 
     @property
     def tracking_time_s(self) -> float:

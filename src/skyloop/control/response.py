@@ -14,20 +14,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
-from skyloop.control.limiting import GRAVITY_M_S2, shortened, within
+from skyloop.control.limiting import GRAVITY_M_S2, Array, require_positive, shortened, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
-
-Array = NDArray[np.float64]
 
 _STEP_S = 0.01  # time step of the prediction
 _LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion during it is unknown
@@ -37,11 +34,7 @@ _KEPT_SETPOINTS = 64  # number of newest set-points to keep
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop. The defaults are the AR.Drone's, as far as public sources give them.
-
-    Raises:
-        UsageError: A number is out of its range.
-    """
+    """The response of a vehicle's velocity loop: by default the AR.Drone's, as far as public sources give it."""
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
     lag_s: float = 0.1  #: lag of the lean behind the demand; Engel, Sturm and Cremers, IROS 2012: 10 1/s
@@ -52,11 +45,7 @@ class ResponseSettings:
     trim_s: float = 0.3  #: time constant for learning the trim
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            lowest_is_fine = name == "delay_s" and value == 0.0
-            if not (0.0 < value < math.inf or lowest_is_fine):
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        require_positive({"delay_s"}, **asdict(self))
         if not self.tilt_rad < math.pi / 2:
             raise UsageError(f"tilt_rad is {self.tilt_rad!r} and must be below a quarter turn")
 
@@ -68,21 +57,13 @@ class ResponseSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0.
+    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
 
-    Attributes:
-        at_ns: Time at which the set-point takes effect.
-        moved: Distance moved since the last feedback, (2,) [m].
-        velocity: Velocity, (2,) [m/s].
-        push: Acceleration caused by the air, (2,) [m/s²].
-        trim: Acceleration that the loop adds to what the velocity error demands, (2,) [m/s²].
-    """
-
-    at_ns: int
-    moved: Array
-    velocity: Array
-    push: Array
-    trim: Array
+    at_ns: int  #: time at which the set-point takes effect
+    moved: Array  #: distance moved since the last feedback, (2,) [m]
+    velocity: Array  #: velocity, (2,) [m/s]
+    push: Array  #: acceleration caused by the air, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop adds to what the velocity error demands, (2,) [m/s²]
 
 
 class VelocityResponse:
@@ -149,12 +130,7 @@ class VelocityResponse:
         return Predicted(end_ns, moved, velocity, self._push, self._trim)
 
     def setpoint(self, acceleration: Array, motion: Predicted) -> Array:
-        """Return the velocity set-point (2,) [m/s] that results in a wanted acceleration.
-
-        Args:
-            acceleration: Wanted acceleration, (2,) [m/s²]; at most what leaning can produce against the push.
-            motion: The motion returned by :meth:`predict`.
-        """
+        """Return the velocity set-point (2,) [m/s] for an acceleration (2,) [m/s²], as far as leaning allows."""
         by_lean = shortened(acceleration - motion.push, self.settings.most_m_s2)
         return motion.velocity + (by_lean - motion.trim) / self.settings.gain_per_s
 

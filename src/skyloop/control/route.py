@@ -81,25 +81,15 @@ Action = Look | Wait | Photo
 
 
 class RouteWaypoint(_Part, frozen=True):
-    """A waypoint of a route.
+    """A waypoint of a route."""
 
-    Attributes:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        speed: Maximum speed on the way there [m/s]; None for the route's.
-        yaw: Yaw to turn to on the way there [rad]; None keeps the current yaw.
-        look_at: Point (x, y) to face instead of a fixed yaw [m].
-        actions: Actions to perform there, in this order.
-    """
-
-    x: Metres
-    y: Metres
-    z: Metres
-    speed: Speed | None = None
-    yaw: Angle | None = None
-    look_at: Point | None = None
-    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()
+    x: Metres  #: east [m]
+    y: Metres  #: north [m]
+    z: Metres  #: up [m]
+    speed: Speed | None = None  #: maximum speed on the way there [m/s]; None for the route's
+    yaw: Angle | None = None  #: yaw to turn to on the way there [rad]; None keeps the current yaw
+    look_at: Point | None = None  #: point (x, y) to face instead of a fixed yaw [m]
+    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform there, in this order
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,23 +114,18 @@ class RouteWaypoint(_Part, frozen=True):
 class Route(_Part, frozen=True, kw_only=True):
     """A route.
 
-    Attributes:
-        waypoints: Waypoints in flight order.
-        name: A human-readable name.
-        speed: Maximum speed towards waypoints that don't have their own [m/s].
-        end: What to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of
-            the route at the last waypoint's height and lands.
-        version: Version of the file format.
-
     Raises:
         UsageError: A number is not finite, or there are no waypoints.
     """
 
+    #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
-    name: Name = ""
-    speed: Speed = 0.5
+    name: Name = ""  #: A human-readable name
+    speed: Speed = 0.5  #: maximum speed towards waypoints that don't have their own [m/s]
+    #: what to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of the
+    #: route at the last waypoint's height and lands
     end: Literal["hover", "land", "return"] = "hover"
-    version: Literal[1] = VERSION
+    version: Literal[1] = VERSION  #: version of the file format
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,11 +144,7 @@ class Route(_Part, frozen=True, kw_only=True):
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of a file.
-
-    Raises:
-        UsageError: The content is not a route; the message says where and why.
-    """
+    """Read a route from the content of a file; UsageError says where and why the content is not a route."""
     try:
         return checked(msgspec.json.decode(content, type=Route))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -194,11 +175,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route after checking the range of every number.
-
-    Raises:
-        UsageError: A number is out of range. Routes built by a program are checked only here.
-    """
+    """Return the route after checking the range of every number, of routes built by a program only here."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -207,33 +184,20 @@ def checked(route: Route) -> Route:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The conditions against which a route is checked.
+    """The conditions against which a route is checked."""
 
-    Attributes:
-        space: Where flying is allowed.
-        start: Start of the route [m]: the vehicle's position, or above it before take-off; None if unknown.
-        problem: Why the vehicle can't be flown by position; empty if it can.
-        ground_m: Height of the ground in world axes; None if unknown.
-        battery: Current charge, 0 to 1; None if unknown.
-        speed_m_s: Maximum horizontal speed.
-        climb_m_s: Maximum speed up or down.
-        altitude_m: Maximum height above the ground.
-        battery_warn: Charge below which the vehicle warns.
-        battery_land: Charge below which the vehicle lands.
-        flight_time_s: Flight time with a full battery.
-    """
-
-    space: Space = field(default_factory=Space)
+    space: Space = field(default_factory=Space)  #: where flying is allowed
+    #: start of the route [m]: the vehicle's position, or above it before take-off; None if unknown
     start: Vector | None = None
-    problem: str = ""
-    ground_m: float | None = None
-    battery: float | None = None
-    speed_m_s: float = 2.0
-    climb_m_s: float = 1.0
-    altitude_m: float = 5.0
-    battery_warn: float = 0.2
-    battery_land: float = 0.1
-    flight_time_s: float = 600.0
+    problem: str = ""  #: why the vehicle can't be flown by position; empty if it can
+    ground_m: float | None = None  #: height of the ground in world axes; None if unknown
+    battery: float | None = None  #: current charge, 0 to 1; None if unknown
+    speed_m_s: float = 2.0  #: maximum horizontal speed
+    climb_m_s: float = 1.0  #: maximum speed up or down
+    altitude_m: float = 5.0  #: maximum height above the ground
+    battery_warn: float = 0.2  #: charge below which the vehicle warns
+    battery_land: float = 0.1  #: charge below which the vehicle lands
+    flight_time_s: float = 600.0  #: flight time with a full battery
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -259,11 +223,7 @@ class RouteCheck(msgspec.Struct, frozen=True):
 
 
 def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) -> Conditions:
-    """Read the conditions from a vehicle's newest feedback and its parameters.
-
-    Raises:
-        ParameterError: The no-fly zones can't be read.
-    """
+    """Read the conditions from a vehicle's newest feedback and its parameters."""
     usual = {f"{BOX}.{axis}_{end}": far for axis in "xyz" for end, far in (("low", -FAR_M), ("high", FAR_M))}
 
     def number(name: str, default: float = 0.0) -> float:
@@ -300,13 +260,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
     """Check a route against a drone's newest feedback and parameters. Waits for the proxy's answer.
 
-    Args:
-        drone: The drone; an observer's connection is enough.
-        route: The route.
-        wait_s: Time to wait for a position, for example after connecting.
-
-    Raises:
-        LinkError: The proxy does not answer.
+    An observer's connection is enough. A position, for example after connecting, is awaited for ``wait_s``.
     """
     feedback = None
     with suppress(LinkError):  # having no feedback yet becomes a finding
@@ -323,10 +277,6 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
 
     The estimate adds up the time of each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the
     duration of the actions. The battery falls in proportion to this time, as given by ``flight_time_s``.
-
-    Args:
-        route: The route.
-        conditions: The vehicle, its limits and where flying is allowed.
     """
     found: list[Finding] = []
 

@@ -18,16 +18,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.client.actions import OVERRULED
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.controller import Controller
-from skyloop.control.route import (
-    Action,
-    Look,
-    Photo,
-    Route,
-    RouteCheck,
-    RouteWaypoint,
-    Wait,
-    check_for,
-)
+from skyloop.control.route import Action, Look, Photo, Route, RouteCheck, RouteWaypoint, Wait, check_for
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.extend import ask, commands, let_go
@@ -92,22 +83,13 @@ Effect = Command | TakePhoto | Progress
 
 
 class RouteLaw:
-    """The course of one flight along a route. Its methods return the effects to carry out now, in order.
-
-    Args:
-        route: The route.
-
-    Attributes:
-        state: State of the flight.
-        index: Index of the next or current waypoint, from 0; past the last one on the way back.
-        problem: Why the law paused without being asked to; empty otherwise.
-    """
+    """The course of one flight along a route. Its methods return the effects to carry out now, in order."""
 
     def __init__(self, route: Route) -> None:
         self.route = route
-        self.state = RouteState.READY
-        self.index = 0
-        self.problem = ""
+        self.state = RouteState.READY  #: state of the flight
+        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the way back
+        self.problem = ""  #: why the law paused without being asked to; empty otherwise
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
         self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun
@@ -134,11 +116,7 @@ class RouteLaw:
     # Requests ---------------------------------------------------------------------------------------------------
 
     def start(self, feedback: Feedback) -> list[Effect]:
-        """Begin at the first waypoint.
-
-        Raises:
-            UsageError: The vehicle is on the ground, or its position is unknown.
-        """
+        """Begin at the first waypoint; UsageError if the vehicle is on the ground or its position is unknown."""
         problem = lacking(feedback)
         if problem or feedback.position_m is None:
             raise UsageError(f"the route can't be flown: {problem}")
@@ -186,12 +164,7 @@ class RouteLaw:
     # The vehicle's progress ---------------------------------------------------------------------------------------
 
     def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Take the next step according to the newest feedback.
-
-        Args:
-            feedback: The newest feedback.
-            now_ns: The time, on the clock of ``feedback.captured_ns``.
-        """
+        """Take the next step according to the newest feedback; ``now_ns`` is on the clock of its capture time."""
         if not self.is_under_way:
             return []
         if not feedback.state.airborne:

@@ -8,25 +8,157 @@ target, if the vehicle knows its own height; and the vehicle's motion, because c
 cue, the initial range is a nominal one and all ranges scale with it: the law then keeps the apparent size, as in
 image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object tracking and
 following for unmanned aerial vehicles", SSRR 2013).
+
+Directions are in *odometry axes* (see :mod:`.airframe`). They are levelled by the attitude at the time of capture, so
+the vehicle's roll and pitch don't move an object. For an edge cut off by the image, only a bound is known.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.limiting import within
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.limiting import Array, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
+from skyloop.messages import CameraInfo, Feedback, Intrinsics
+from skyloop.poses import mounting_rotation
+from skyloop.vision.lens import project, unproject
+from skyloop.vision.tracking import Box
 
-Array = NDArray[np.float64]
+_CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off ...
+_CUT: Final = 0.07
+_BESIDE: Final = 0.75  # distance from the optical axis in image sizes; 0.5 is the edge
+_STEEPEST: Final = 0.15  # minimum cosine of the elevation; an object almost straight above or below has no azimuth
+_TILT_RAD: Final = 0.008  # error of the attitude at the time of capture, which moves both edges equally
+_YAW_RAD: Final = 0.006  # error of the yaw at the time of capture
+_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, from encoding, network and decoding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """The pose of a camera when it captured an image."""
+
+    position: Array  #: position in odometry axes, (3,) [m]; the third value is the height above the ground, if known
+    rotation: Array  #: rotation from optical axes to odometry axes, (3, 3)
+    intrinsics: Intrinsics
+    size: tuple[int, int]  #: width and height of the image [px]
+    yaw_rad: float = _YAW_RAD  #: standard deviation of the yaw at the time of capture
+    tilt_rad: float = _TILT_RAD  #: standard deviation of the tilt
+    #: climb by the vehicle's integrated velocity, regardless of the ground [m]; None if unknown
+    rise_m: float | None = None
+
+    @classmethod
+    def at(
+        cls,
+        mounting: CameraInfo,
+        feedback: Feedback,
+        body: Array,
+        intrinsics: Intrinsics,
+        size: tuple[int, int],
+        rates_rad_s: tuple[float, float] = (0.0, 0.0),
+        risen_m: float | None = None,
+    ) -> Camera | None:
+        """Determine a camera's pose; None if the attitude is unknown.
+
+        The body's position is (3,) [m], the third value its height above the ground, if known. Where images and
+        attitude have no common clock, the rates of yaw and tilt tell how uncertain the attitude at the time of capture
+        is. ``risen_m`` is the climb by the vehicle's integrated velocity; None if unknown.
+        """
+        if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
+            return None
+        to_level = feedback.rotation
+        yaw_rad = math.hypot(_YAW_RAD, _UNTIMELY_S * rates_rad_s[0])
+        tilt_rad = math.hypot(_TILT_RAD, _UNTIMELY_S * rates_rad_s[1])
+        offset = np.zeros(3) if mounting.position_m is None else np.asarray(mounting.position_m)
+        aside, rotation = to_level @ offset, to_level @ mounting_rotation(mounting)
+        rise_m = None if risen_m is None else risen_m + float(aside[2])
+        return cls(body + aside, rotation, intrinsics, size, yaw_rad, tilt_rad, rise_m)
+
+    def pixel(self, point: Array) -> tuple[float, float] | None:
+        """Return the pixel of a point (3,) in the image or slightly outside it [px]; None if it is further out.
+
+        A lens model is valid only within the image: far outside, the distortion's polynomial folds back into it.
+        """
+        ray = self.rotation.T @ (point - self.position)
+        lens, (columns, rows) = self.intrinsics, self.size
+        beside = np.abs(ray[:2]) > _BESIDE * ray[2] * np.array([columns / lens.fx, rows / lens.fy])
+        if ray[2] <= 0.0 or beside.any():
+            return None
+        x, y = project(ray[None, :], self.intrinsics)[0].tolist()
+        return (x, y) if math.isfinite(x) and math.isfinite(y) else None
+
+    def shows(self, point: Array) -> bool:
+        """Return whether a point (3,) is within the image, provided that nothing hides it."""
+        pixel = self.pixel(point)
+        return pixel is not None and 0.0 <= pixel[0] < self.size[0] and 0.0 <= pixel[1] < self.size[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoxView:
+    """The directions of a box's middle and edges."""
+
+    azimuth: float  #: azimuth of the middle, counter-clockwise from x of odometry axes [rad]
+    bottom: float | None  #: tangent of the lower edge's elevation; None if the image cuts it off
+    top: float | None  #: tangent of the upper edge's elevation; None if the image cuts it off
+    azimuth_rad: float  #: standard deviation of the azimuth
+    edge: float  #: standard deviation of each edge, independent of the other
+    #: if the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None
+    below: float | None = None
+    #: if the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None
+    above: float | None = None
+    tilt: float = _TILT_RAD  #: standard deviation common to both edges
+
+    @classmethod
+    def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
+        """Compute the directions of a box (x, y, width, height [px]); None if it is almost straight up or down.
+
+        ``noise`` is the standard deviation of an edge as a fraction of the box's height; one pixel is added. None also
+        for a box that this camera can't show.
+        """
+        x, y, width, height = box
+        columns, rows = camera.size
+        middle = x + (width - 1) / 2
+        edges = [(middle, y), (middle, y + height - 1), (middle, y + (height - 1) / 2)]
+        rays = unproject(edges, camera.intrinsics) @ camera.rotation.T
+        flat = np.hypot(rays[:, 0], rays[:, 1])
+        if not (np.isfinite(rays).all() and (flat > _STEEPEST).all()):
+            return None
+        top, bottom, _ = (rays[:, 2] / flat).tolist()
+        focal = math.sqrt(camera.intrinsics.fx * camera.intrinsics.fy)
+        edge = (1.0 + noise * height) / focal
+        across = (1.0 + noise * width) / focal
+        near = max(_CUT_PX, _CUT * height)
+        if x < near or x + width > columns - near:
+            across += 0.3 * width / focal  # the middle of the visible part is not the object's middle
+        cut_below, cut_above = y + height > rows - near, y < near
+        return cls(
+            azimuth=math.atan2(rays[2, 1], rays[2, 0]),
+            bottom=None if cut_below else bottom,
+            top=None if cut_above else top,
+            azimuth_rad=math.hypot(across, camera.yaw_rad),
+            edge=edge,
+            below=bottom if cut_below else None,
+            above=top if cut_above else None,
+            tilt=camera.tilt_rad,
+        )
+
+
+def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
+    """Return the approximate box [px] of an upright object, so much wider than high; None if not all is in view."""
+    low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
+    if low is None or high is None or low[1] - high[1] < 1.0:
+        return None
+    height = low[1] - high[1] + 1.0
+    width = share * height
+    return (low[0] + high[0]) / 2 - (width - 1.0) / 2, high[1], width, height
+
 
 _NEAREST_M: Final = 0.3  # minimum range
 _RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning: gusts, and a wrong drag constant
@@ -52,24 +184,15 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """Prior knowledge about a kind of target.
-
-    Attributes:
-        height_m: Height; None if unknown.
-        height_share: Standard deviation of the height, as a fraction of the height.
-        radius_m: Distance from the target's middle to its visible lower edge.
-        intensity_m2_s3: Intensity of the random acceleration; its root is the change of the velocity within a second.
-        on_ground: Whether the target is on the ground. None assumes so for a target with a class; for others it is one
-            hypothesis among several (:mod:`.target_range`).
-
-    Raises:
-        UsageError: A number is out of its range.
-    """
+    """Prior knowledge about a kind of target."""
 
     height_m: float | None = None
-    height_share: float = 0.1
-    radius_m: float = 0.0
+    height_share: float = 0.1  #: standard deviation of the height, as a fraction of the height
+    radius_m: float = 0.0  #: distance from the target's middle to its visible lower edge
+    #: intensity of the random acceleration; its root is the change of the velocity within a second
     intensity_m2_s3: float = 1.0
+    #: Whether the target is on the ground. None assumes so for a target with a class; for others it is one hypothesis
+    #: among several (:mod:`.target_range`).
     on_ground: bool | None = None
 
     def __post_init__(self) -> None:
@@ -96,29 +219,17 @@ UNKNOWN: Final = Traits(radius_m=0.1)  #: a target without a class
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """The state of a target at a point in time.
+    """The state of a target at a point in time."""
 
-    Attributes:
-        at_ns: Time of the state on the proxy's clock.
-        foot: Position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground.
-        velocity: Horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own.
-        height_m: Height of the target.
-        place_m: Standard deviation of the position: the root of the sum of the horizontal variances.
-        range_m: Horizontal distance from the camera that last saw the target.
-        range_deviation_m: Standard deviation along the line of sight.
-        range_known: Whether the range is good enough to fly by; False if it is only a guess.
-        margin_m: Extra distance to keep because the target may be closer; 0 for a target on the ground.
-    """
-
-    at_ns: int
-    foot: Array
-    velocity: Array
+    at_ns: int  #: time of the state on the proxy's clock
+    foot: Array  #: position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground
+    velocity: Array  #: horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own
     height_m: float
-    place_m: float
-    range_m: float
-    range_deviation_m: float
-    range_known: bool = True
-    margin_m: float = 0.0
+    place_m: float  #: standard deviation of the position: the root of the sum of the horizontal variances
+    range_m: float  #: horizontal distance from the camera that last saw the target
+    range_deviation_m: float  #: standard deviation along the line of sight
+    range_known: bool = True  #: whether the range is good enough to fly by; False if it is only a guess
+    margin_m: float = 0.0  #: extra distance to keep because the target may be closer; 0 for a target on the ground
 
     @property
     def middle(self) -> Array:
@@ -133,26 +244,17 @@ class _Estimate(NamedTuple):
 
 
 class TargetEstimator:
-    """The filter for one target.
-
-    Attributes:
-        traits: Prior knowledge about the target.
-        refused: Number of consecutive boxes that did not fit.
-        seen_ns: Capture time of the last box that fit; None before :meth:`start`.
-    """
+    """The filter for one target."""
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
-        """Initialise the filter.
+        """Initialise the filter; ``nominal_m`` is the initial distance if there is no cue.
 
-        Args:
-            traits: Prior knowledge about the target.
-            nominal_m: Initial distance to assume if there is no cue.
-            relative: Whether the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
-                target's motion.
+        If ``relative``, the vehicle's own velocity comes from dead reckoning, whose changing error adds to the target's
+        motion.
         """
-        self.traits = traits
-        self.refused = 0
-        self.seen_ns: int | None = None
+        self.traits = traits  #: prior knowledge about the target
+        self.refused = 0  #: number of consecutive boxes that did not fit
+        self.seen_ns: int | None = None  #: capture time of the last box that fit; None before :meth:`start`
         self._nominal_m, self._relative = nominal_m, relative
         self._intensity = traits.intensity_m2_s3 + (_RECKONING_M2_S3 if relative else 0.0)
         self._at_ns = 0
@@ -164,14 +266,7 @@ class TargetEstimator:
         self._interval_s = 0.0  # time between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
-        """Start from a first box.
-
-        Args:
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-            ground: Whether the camera's height above the ground is known.
-        """
+        """Start from a first box; ``ground`` tells whether the camera's height above the ground is known."""
         traits, height = self.traits, float(camera.position[2])
         ground = ground and traits.on_ground is not False
         guesses = [(self._nominal_m, 0.5)]  # range, relative deviation
@@ -214,12 +309,7 @@ class TargetEstimator:
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
         """Start from a first box at a guessed range, with the size that explains the box.
 
-        Args:
-            distance_m: The guessed range, with which foot and height scale.
-            share: Standard deviation of the range, as a fraction of the range.
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
+        ``share`` is the range's standard deviation as a fraction of it. Foot and height scale with the range.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -240,9 +330,6 @@ class TargetEstimator:
         """Assume, right after the start, that the target's speed is in proportion to its range.
 
         Without this, boxes that hardly move would favour the farthest of several guesses.
-
-        Args:
-            distance_m: The guessed range.
         """
         pace = _PACE_PER_S * distance_m
         self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
@@ -259,10 +346,10 @@ class TargetEstimator:
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Measure how badly a box fits.
 
-        Returns:
-            The squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own boxes,
-            and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are infinite
-            for a box that is too large above and below, because occlusion hides parts of a target but never adds any.
+        Return the squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own
+        boxes, and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are
+        infinite for a box that is too large above and below, because occlusion hides parts of a target but never adds
+        any.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
@@ -274,20 +361,9 @@ class TargetEstimator:
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box.
+        """Update with a box; return whether it was used. One over half a second older than the newest is not.
 
         An edge far from its expected position is ignored as hidden. A box in a different direction is refused.
-
-        Args:
-            view: Directions of the box.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-
-        Returns:
-            Whether the box was used; False also for a box more than half a second older than the newest.
-
-        Raises:
-            UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -318,12 +394,6 @@ class TargetEstimator:
         """Predict the target's state. It moves for at most four seconds, while the uncertainty keeps growing.
 
         A hidden target keeps its motion from shortly before, because the occluder cuts off its last boxes.
-
-        Args:
-            at_ns: The time to predict for.
-
-        Raises:
-            UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
-from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
 from skyloop.vision import LongTermTracker
 from skyloop.vision.appearance import colours
@@ -68,13 +67,7 @@ class _Seen:
 
 
 class TargetFinder:
-    """Finds a target in a sequence of images.
-
-    Attributes:
-        estimator: The target's motion; None before the first sighting.
-        class_name: Class of the target, if it is known.
-        detections: Detections in the newest image searched by a detector.
-    """
+    """Finds a target in a sequence of images."""
 
     def __init__(
         self,
@@ -85,24 +78,16 @@ class TargetFinder:
         nominal_m: float = 4.0,
         relative: bool = False,
     ) -> None:
-        """Initialise the finder.
+        """Initialise the finder with the target's box in the first image [px], or a class: its largest detection.
 
-        Args:
-            box: Box of the target in the first image: x, y, width, height [px].
-            class_name: Class of the target in the box; without a box, its largest detection is the target.
-            traits: Traits of the target; None for those of its class.
-            nominal_m: Initial distance to assume if there is no cue.
-            relative: Whether the vehicle does not know its own velocity.
-
-        Raises:
-            UsageError: There is neither a box nor a class.
-            MissingExtraError: OpenCV is not installed.
+        ``nominal_m`` is the initial distance if there is no cue; if ``relative``, the vehicle does not know its own
+        velocity.
         """
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
-        self.estimator: TargetEstimator | None = None
+        self.estimator: TargetEstimator | None = None  #: the target's motion; None before the first sighting
         self.class_name = class_name
-        self.detections: tuple[Detection, ...] = ()
+        self.detections: tuple[Detection, ...] = ()  #: detections in the newest image searched by a detector
         self._first_box = box
         self._given, self._unnamed = traits, class_name is None
         self._nominal_m, self._relative = nominal_m, relative
@@ -121,17 +106,9 @@ class TargetFinder:
     def see(
         self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
     ) -> Sighting:
-        """Find the target in the next image.
+        """Find the target in the next image; ``detections`` are None if it was not searched.
 
-        Args:
-            image: A :class:`skyloop.Frame` or an array like those for trackers.
-            camera: The camera that took the image.
-            captured_ns: Capture time of the image on the proxy's clock.
-            ground: Whether the camera's height above the ground is known.
-            detections: Detections in the image; None if it was not searched.
-
-        Raises:
-            UsageError: The first box does not fit into the image.
+        ``ground`` tells whether the camera's height above the ground is known.
         """
         self._frames.append(_Seen(image, camera, captured_ns))
         self._ground = ground

@@ -14,16 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyloop.clock import seconds
 from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.behaviour import Behaviour, camera_info
-from skyloop.control.chase_law import ChaseLaw
-from skyloop.control.chase_settings import LOSSES, ChaseSettings, FollowMode, TargetPhase
-from skyloop.control.target_estimate import TargetEstimator, Traits
+from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.limiting import Array
+from skyloop.control.target_estimate import Camera, TargetEstimator, Traits, predicted_box
 from skyloop.control.target_finder import Sighting, TargetFinder
-from skyloop.control.target_view import Camera, predicted_box
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
 from skyloop.messages.relayed import Colour, Shape
@@ -35,8 +33,6 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
     from skyloop.client.results import Result
 
-
-Array = NDArray[np.float64]
 
 _SEEN: Final[Colour] = (64, 220, 100)
 _LOST: Final[Colour] = (255, 180, 60)
@@ -66,42 +62,22 @@ class FollowStatus:
 
 
 class TargetFollower(AirframeLaw):
-    """Follows a target. Call it from one thread.
-
-    Attributes:
-        mode: How to follow the target; can be changed in flight.
-        over: Whether the follower gave up because the target was lost for too long.
-    """
+    """Follows a target. Call it from one thread."""
 
     def __init__(
         self,
-        camera: CameraInfo,
+        camera: CameraInfo,  # the camera, including its mounting; it must look forward
         *,
-        box: Box | None = None,
+        box: Box | None = None,  # box of the target in the first frame given to :meth:`look`: x, y, width, height [px]
+        # class of which to follow the largest object if there is no box; needs detections
         class_name: str | None = None,
-        mode: FollowMode = FollowMode.FOLLOW,
-        detector: ObjectDetector | None = None,
-        detects: bool = False,
-        traits: Traits | None = None,
-        settings: ChaseSettings | None = None,
+        mode: FollowMode = FollowMode.FOLLOW,  # how to follow
+        detector: ObjectDetector | None = None,  # detector to run on every frame on the thread that calls :meth:`look`
+        detects: bool = False,  # whether detections arrive from elsewhere through :meth:`detected`
+        traits: Traits | None = None,  # prior knowledge about the target; None for that of its class
+        settings: ChaseSettings | None = None,  # settings of the law; None for the defaults
     ) -> None:
-        """Initialise the follower.
-
-        Args:
-            camera: The camera, including its mounting; it must look forward.
-            box: Box of the target in the first frame given to :meth:`look`: x, y, width, height [px].
-            class_name: Class of which to follow the largest object if there is no box; needs detections.
-            mode: How to follow.
-            detector: Detector to run on every frame on the thread that calls :meth:`look`.
-            detects: Whether detections arrive from elsewhere through :meth:`detected`.
-            traits: Prior knowledge about the target; None for that of its class.
-            settings: Settings of the law; None for the defaults.
-
-        Raises:
-            UsageError: There is neither a box nor a class, a class has no detections, the camera does not look forward,
-                or its mounting is unknown.
-            MissingExtraError: OpenCV or, for detections, SciPy is not installed.
-        """
+        """Initialise the follower; UsageError without a target, or for a camera that does not look forward."""
         if mounting_rotation(camera)[0, 2] < 0.5:
             raise UsageError(f"camera {camera.name!r} does not look forward, as following needs")
         if box is None and class_name is None:
@@ -115,9 +91,9 @@ class TargetFollower(AirframeLaw):
         self._camera = camera
         self._detector = detector
         self._box, self._class_name, self._traits = box, class_name, traits
-        self._finder: TargetFinder | None = None
+        self.finder: TargetFinder | None = None  #: None before the first frame
         self._seen_ns: int | None = None  # capture time of the last frame that showed, or may have shown, the target
-        self._sighting = Sighting(None, None)
+        self.sighting = Sighting(None, None)  #: the result of searching the newest frame
         self._view: Camera | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
         self._trace: deque[tuple[int, Array]] = deque()
@@ -150,19 +126,9 @@ class TargetFollower(AirframeLaw):
         """Whether the follower has given up."""
         return self.phase is TargetPhase.GIVEN_UP
 
-    @property
-    def sighting(self) -> Sighting:
-        """The result of searching the newest frame."""
-        return self._sighting
-
-    @property
-    def finder(self) -> TargetFinder | None:
-        """Finder of the target; None before the first frame."""
-        return self._finder
-
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        if self._finder is None:
+        if self.finder is None:
             self.airframe.by_tilt = feedback.velocity_m_s is None
         super().feedback(feedback)
         if not self._relative and self.airframe.feedback is not None:
@@ -179,13 +145,9 @@ class TargetFollower(AirframeLaw):
         return self.airframe.by_tilt
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target in the next frame. The first call starts with the given box.
+        """Find the target in the next frame, from the given box on; return the box, track and phase to draw.
 
-        Returns:
-            Shapes to draw: the box, its track, its expected position, and the phase.
-
-        Raises:
-            UsageError: The first box does not fit into the image, or the camera's intrinsics are unknown.
+        The first box must fit into the image, and the camera's intrinsics must be known, or this raises UsageError.
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
@@ -211,8 +173,8 @@ class TargetFollower(AirframeLaw):
         view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
-        if self._finder is None:
-            self._finder = TargetFinder(
+        if self.finder is None:
+            self.finder = TargetFinder(
                 box=self._box,
                 class_name=self._class_name,
                 traits=self._traits,
@@ -221,16 +183,16 @@ class TargetFollower(AirframeLaw):
             )
         found = None if self._detector is None else self._detector.detect(frame)
         self._view, self._frame_ns = view, frame.captured_ns
-        self._sighting = self._finder.see(frame, view, frame.captured_ns, ground=ground, detections=found)
-        if self._sighting.box is not None or self._sighting.contested:
+        self.sighting = self.finder.see(frame, view, frame.captured_ns, ground=ground, detections=found)
+        if self.sighting.box is not None or self.sighting.contested:
             self._seen_ns = frame.captured_ns
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
         """Use a processor's detections for a recent frame, which arrive after that frame."""
-        if self._finder is not None:
+        if self.finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
-            if self._finder.detected(detections, captured_ns, ground=ground):
+            if self.finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
@@ -242,7 +204,7 @@ class TargetFollower(AirframeLaw):
             return Attitude() if self._relative else Velocity()
         self._since_s(now_ns)
         self._seen_ns = not_ahead(self._seen_ns, now_ns)
-        finder = self._finder
+        finder = self.finder
         return self._law.step(
             now_ns,
             self._motion(now_ns),
@@ -257,14 +219,14 @@ class TargetFollower(AirframeLaw):
 
     @property
     def _estimator(self) -> TargetEstimator | None:
-        return None if self._finder is None else self._finder.estimator
+        return None if self.finder is None else self.finder.estimator
 
     @property
     def status(self) -> FollowStatus:
         """The state of the pursuit at the newest frame and set-point."""
         estimator, at_ns = self._estimator, self._frame_ns
-        box, confidence = self._sighting.box, self._sighting.confidence
-        class_name = self._class_name if self._finder is None else self._finder.class_name
+        box, confidence = self.sighting.box, self.sighting.confidence
+        class_name = self._class_name if self.finder is None else self.finder.class_name
         known = FollowStatus(self.phase.value, self.mode, box, confidence, class_name, unknown=self.problem)
         if estimator is None or at_ns is None or self._view is None:
             return known
@@ -285,18 +247,18 @@ class TargetFollower(AirframeLaw):
     def _problem(self) -> str:
         if self.problem:
             return self.problem
-        if self._sighting.contested:
+        if self.sighting.contested:
             return "a look-alike is at its expected position"
         return "at the end of the leash" if self._law.held_by else ""
 
     def _drawing(self, captured_ns: int) -> list[Shape]:
-        assert self._finder is not None
-        view, estimator = self._view, self._finder.estimator
+        assert self.finder is not None
+        view, estimator = self._view, self.finder.estimator
         assert view is not None
-        box = self._sighting.box
+        box = self.sighting.box
         colour = _SEEN if box is not None else _LOST
         # A processor draws its own detections on their frames.
-        found = () if self._detector is None else self._finder.detections[:16]
+        found = () if self._detector is None else self.finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
             return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
@@ -317,8 +279,8 @@ class TargetFollower(AirframeLaw):
         middle = view.pixel(state.middle)
         if middle is not None:
             shapes.append(Points((middle,), colour))
-        sure = "" if self._sighting.confidence is None else f" {self._sighting.confidence:.0%}"
-        name = self._finder.class_name or "target"
+        sure = "" if self.sighting.confidence is None else f" {self.sighting.confidence:.0%}"
+        name = self.finder.class_name or "target"
         text = f"{name}{sure}  {self.phase.value}  {state.range_m:.1f} ± {state.range_deviation_m:.1f} m"
         return [*shapes, Text(text, (8.0, 16.0), colour)]
 

@@ -22,8 +22,16 @@ import numpy as np
 
 from skyloop.clock import seconds
 from skyloop.control.limiting import within
-from skyloop.control.target_estimate import LEAST_SLOPE, SURE_OF_SIZE, UNKNOWN, TargetEstimator, TargetState, Traits
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.target_estimate import (
+    LEAST_SLOPE,
+    SURE_OF_SIZE,
+    UNKNOWN,
+    BoxView,
+    Camera,
+    TargetEstimator,
+    TargetState,
+    Traits,
+)
 
 _RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # initial ranges of the hypotheses, up to 29 m
 _SHARE: Final = 0.3  # standard deviation of each range, as a fraction of the range
@@ -50,14 +58,7 @@ class RangeEstimator(TargetEstimator):
     def __init__(
         self, traits: Traits, *, nominal_m: float = 4.0, relative: bool = False, before: TargetState | None = None
     ) -> None:
-        """Initialise the filters.
-
-        Args:
-            traits: Prior knowledge about the target.
-            nominal_m: Initial distance to assume if the vehicle does not know its own height.
-            relative: As in :class:`TargetEstimator`.
-            before: State of the target when it was lost, if its range was known.
-        """
+        """Initialise the filters; ``before`` is the target's state when it was lost, if its range was known."""
         super().__init__(traits, nominal_m=nominal_m, relative=relative)
         self._seen_before = before
         self._guesses: list[TargetEstimator] = []
@@ -250,14 +251,7 @@ def _off_climb(camera: Camera) -> float:
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Create the filter for a target; call ``start`` on it.
-
-    Args:
-        class_name: Class of the target; None if a person drew a box without a class.
-        traits: Prior knowledge about the target; None if there is none.
-        nominal_m: Initial distance to assume if there is no cue.
-        relative: Whether the vehicle does not know its own velocity.
-    """
+    """Create the filter for a target, to be started; without a class, a person drew a box."""
     if traits is not None and (class_name is not None or traits.on_ground is not None):
         return TargetEstimator(traits, nominal_m=nominal_m, relative=relative)
     return RangeEstimator(traits or UNKNOWN, nominal_m=nominal_m, relative=relative)

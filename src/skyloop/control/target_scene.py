@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, Traits
-from skyloop.control.target_view import BoxView, Camera
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, Traits
 from skyloop.estimation import assignment
 from skyloop.vision.object_tracks import Detection
 
@@ -53,39 +52,23 @@ _SURE: Final = 0.35  # minimum score of a detection that may be a new object
 
 @dataclass(slots=True, eq=False)
 class SceneObject:
-    """A detected object.
+    """A detected object."""
 
-    Attributes:
-        number: Number that identifies the object; never reused.
-        class_name: Class of the detections.
-        estimator: Filter for the motion.
-        detection: The last detection.
-        looks: Colours, (6,): see :func:`skyloop.vision.appearance.colours`.
-        places: Colours of the last detection that was not cut off by the image, (n, 6).
-        whole: Whether the last detection was of the whole object.
-        hits: Number of detections.
-        first_ns: Time of the first detection.
-        last_ns: Time of the last detection.
-        seen: Whether the object was detected in the newest image.
-        contested_ns: Time when the object was last contested.
-        velocities: Velocities in the last half second.
-        contested: Whether a detection in the newest image may show either this or another object.
-    """
+    number: int  #: number that identifies the object; never reused
+    class_name: str  #: class of the detections
+    estimator: TargetEstimator  #: filter for the motion
+    detection: Detection  #: the last detection
+    looks: Floats  #: colours, (6,): see :func:`skyloop.vision.appearance.colours`
+    places: Floats  #: colours of the last detection that was not cut off by the image, (n, 6)
+    hits: int  #: number of detections
+    first_ns: int  #: time of the first detection
+    last_ns: int  #: time of the last detection
+    seen: bool = True  #: whether the object was detected in the newest image
+    whole: bool = True  #: whether the last detection was of the whole object
+    contested_ns: int = 0  #: time when the object was last contested
+    contested: bool = False  #: whether a detection in the newest image may show either this or another object
 
-    number: int
-    class_name: str
-    estimator: TargetEstimator
-    detection: Detection
-    looks: Floats
-    places: Floats
-    hits: int
-    first_ns: int
-    last_ns: int
-    seen: bool = True
-    whole: bool = True
-    contested_ns: int = 0
-    contested: bool = False
-
+    #: velocities in the last half second
     velocities: deque[tuple[int, NDArray[np.float64]]] = field(default_factory=deque)
 
     @property
@@ -131,9 +114,7 @@ class _Seen(NamedTuple):
 def unlikeness(one: Floats, other: Floats) -> float:
     """Return the squared colour difference between two objects, in units of the changes caused by light and folds.
 
-    Args:
-        one: Colours of an object, (6,).
-        other: Colours of an object (6,), or of strips of a box (n, 6), of which the most similar counts.
+    The other's colours are (6,), or those of strips of a box (n, 6), of which the most similar counts.
     """
     return float(np.min(_unlike(one, other)))
 
@@ -169,30 +150,16 @@ def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Came
 
 
 class Scene:
-    """The detected objects.
-
-    Attributes:
-        objects: Objects by number.
-        kept: Numbers of objects that are never forgotten, however long they are hidden.
-        dormant: Numbers of objects not matched with detections, because their return is decided elsewhere.
-        traits: Traits by class, for new objects.
-    """
+    """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene.
-
-        Args:
-            relative: Whether the vehicle does not know its own velocity.
-            traits: Traits by class to use instead of :data:`~.target_estimate.TRAITS`.
-
-        Raises:
-            MissingExtraError: SciPy is not installed.
-        """
-        self.objects: dict[int, SceneObject] = {}
-        self.kept: set[int] = set()
+        """Initialise an empty scene, with traits by class that replace :data:`~.target_estimate.TRAITS`."""
+        self.objects: dict[int, SceneObject] = {}  #: objects by number
+        self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
+        #: numbers of objects not matched with detections, because their return is decided elsewhere
         self.dormant: set[int] = set()
         self._relative = relative
-        self.traits = TRAITS | (traits or {})
+        self.traits = TRAITS | (traits or {})  #: traits by class, for new objects
         self._met: dict[frozenset[int], tuple[int, int, NDArray[np.float64]]] = {}
         self._numbers = itertools.count(1)
         self._assign = assignment("matching detections", "detect")
@@ -200,14 +167,9 @@ class Scene:
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections in the next image.
+        """Match the detections in the next image; ``ground`` tells whether the camera's height above it is known.
 
-        Args:
-            detections: Detections in one image.
-            looks: Colours of each detection: (6,), or (n, 6) for n strips from left to right.
-            camera: The camera that took the image.
-            at_ns: Capture time of the image.
-            ground: Whether the camera's height above the ground is known.
+        The looks of each are its colours: (6,), or (n, 6) for n strips from left to right.
         """
         self._forget(at_ns)
         seen = [

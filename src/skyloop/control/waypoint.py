@@ -27,20 +27,14 @@ if TYPE_CHECKING:
 class Waypoint:
     """A position in world axes, and optionally a yaw.
 
-    Attributes:
-        x: East [m].
-        y: North [m].
-        z: Up [m].
-        yaw: Counter-clockwise from x [rad]; None leaves it free.
-
     Raises:
         UsageError: A number is not finite.
     """
 
-    x: float
-    y: float
-    z: float
-    yaw: float | None = None
+    x: float  #: east [m]
+    y: float  #: north [m]
+    z: float  #: up [m]
+    yaw: float | None = None  #: counter-clockwise from x [rad]; None leaves it free
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z", "yaw"):
@@ -78,18 +72,9 @@ def lacking(feedback: Feedback) -> str:
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
-    """Compute the velocity that brings a vehicle to a waypoint.
+    """Compute the velocity that brings a vehicle to a waypoint, in the body's levelled axes [m/s, rad/s].
 
-    Args:
-        goal: The waypoint to fly to.
-        feedback: The vehicle's newest feedback, including position and yaw.
-        settings: Gains and limits; None for the defaults.
-
-    Returns:
-        Set-point in the body's levelled axes [m/s, rad/s].
-
-    Raises:
-        UsageError: Position or yaw is unknown.
+    UsageError if the vehicle's position or yaw is unknown.
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
@@ -107,16 +92,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Return whether the vehicle is within the acceptance radius and almost at rest.
-
-    Args:
-        goal: The waypoint.
-        feedback: The vehicle's newest feedback; without a velocity it counts as at rest.
-        settings: Acceptance radii; None for the defaults.
-
-    Raises:
-        UsageError: Position or yaw is unknown.
-    """
+    """Return whether the vehicle is within the acceptance radius and almost at rest, if its velocity is known."""
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
     velocity = feedback.velocity_m_s
@@ -158,11 +134,7 @@ PositionSource = Callable[[], Fix | None]
 
 
 def fix_of(feedback: Feedback) -> Fix | None:
-    """Return the position reported by the vehicle itself.
-
-    Returns:
-        The fix at the feedback's capture time; None if the position or yaw is unknown.
-    """
+    """Return the position reported by the vehicle itself when captured; None if position or yaw is unknown."""
     if feedback.position_m is None or feedback.yaw_rad is None:
         return None
     return Fix(

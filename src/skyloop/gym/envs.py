@@ -54,11 +54,7 @@ _CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 
 
 class _Observer:
-    """Makes observations in the requested form for all drones of a task.
-
-    Attributes:
-        space: The observation space of one drone.
-    """
+    """Makes observations in the requested form for all drones of a task."""
 
     def __init__(self, task: Reaching, form: Observe, size_px: int) -> None:
         if form not in get_args(Observe):
@@ -72,11 +68,11 @@ class _Observer:
             "pixels": pixels,
             "both": spaces.Dict({"pixels": pixels, "motion": MOTIONS}),
         }
-        self.space = choices[form]
+        self.space = choices[form]  #: the observation space of one drone
         self._size_px = size_px
         self._task = task
         self._form = form
-        self._camera: OnBoard | None = None
+        self._camera: View | None = None
 
     def renew(self) -> None:
         """Switch to the new world, keeping the renderer because it is slow to create."""
@@ -88,8 +84,8 @@ class _Observer:
         if self._form == "state":
             return self._task.observe()
         if self._camera is None:
-            self._camera = OnBoard(self._task.arena, self._size_px)
-        pixels = np.stack([self._camera.draw(drone, self._task.rings(drone)) for drone in range(self._task.drones)])
+            self._camera = on_board(self._task.arena, self._size_px)
+        pixels = np.stack([self._camera.aboard(drone, self._task.rings(drone)) for drone in range(self._task.drones)])
         return pixels if self._form == "pixels" else {"pixels": pixels, "motion": self._task.observe()[:, MOTION]}
 
     def first(self) -> Seen:
@@ -131,7 +127,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         self._task = self.task(1, seconds, gusts_m_s, vehicle)
         self._observer = _Observer(self._task, observe, size_px)
         self.observation_space = self._observer.space
-        self._picture: Picture | None = None
+        self._picture: View | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         super().reset(seed=seed, options=options)
@@ -152,9 +148,9 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
             return None
         arena = self._task.arena
         if self._picture is None:
-            self._picture = Picture(arena)
+            self._picture = View(arena, *SIZE, _FOCAL_PX)
         self._picture.arena = arena
-        return self._picture.draw(self._task.rings(0))
+        return self._picture.outside(self._task.rings(0))
 
 
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
@@ -264,7 +260,7 @@ class GatesVectorEnv(TaskVectorEnv):
     task = Racing
 
 
-class _View:
+class View:
     """Draws one of an arena's drones, and rings, but not the other drones: they share the world only to save time.
 
     Raises :class:`MissingExtraError` without OpenCV.
@@ -282,7 +278,18 @@ class _View:
         self._state = SceneState
         self._renderer = PlanarRenderer(Scene(arena.world, 1))
 
-    def render(self, drone: int, eye: Floats, rotation: Floats, rings: Rings) -> NDArray[np.uint8]:
+    def outside(self, rings: Rings) -> NDArray[np.uint8]:
+        """Draw the first drone for a human viewer, with the next goal as a red ring."""
+        middle = np.array([*self.arena.centres[0], 0.0])
+        return self._draw(0, middle + _FROM, look_at(_FROM, _AT), rings)
+
+    def aboard(self, drone: int, rings: Rings) -> NDArray[np.uint8]:
+        """Draw what a drone's front camera sees, with the next goal as a red ring."""
+        positions, rotations = self.arena.poses()
+        rotation = rotations[drone]
+        return self._draw(drone, positions[drone] + rotation @ _EYE_M, rotation @ _AHEAD, rings)
+
+    def _draw(self, drone: int, eye: Floats, rotation: Floats, rings: Rings) -> NDArray[np.uint8]:
         """Return an RGB image, shape (height, width, 3), uint8, as seen from a point in world axes."""
         import cv2
 
@@ -301,34 +308,9 @@ class _View:
         return np.ascontiguousarray(image[:, :, ::-1])
 
 
-class Picture(_View):
-    """Draws the first drone of an arena for a human viewer."""
-
-    def __init__(self, arena: Arena) -> None:
-        super().__init__(arena, *SIZE, _FOCAL_PX)
-
-    def draw(self, rings: Rings) -> NDArray[np.uint8]:
-        """Return an RGB image, shape (240, 320, 3), uint8, with the next goal as a red ring."""
-        middle = np.array([*self.arena.centres[0], 0.0])
-        return self.render(0, middle + _FROM, look_at(_FROM, _AT), rings)
-
-
-class OnBoard(_View):
-    """Renders the images of the front cameras of an arena's drones.
-
-    Args:
-        arena: The drones.
-        size_px: Edge length of the images.
-    """
-
-    def __init__(self, arena: Arena, size_px: int = ONBOARD_PX) -> None:
-        super().__init__(arena, size_px, size_px, _ONBOARD_FOCAL * size_px)
-
-    def draw(self, drone: int, rings: Rings) -> NDArray[np.uint8]:
-        """Return an RGB image, shape (size, size, 3), uint8, with the next goal as a red ring."""
-        positions, rotations = self.arena.poses()
-        rotation = rotations[drone]
-        return self.render(drone, positions[drone] + rotation @ _EYE_M, rotation @ _AHEAD, rings)
+def on_board(arena: Arena, size_px: int = ONBOARD_PX) -> View:
+    """Return the view of an arena's front cameras, with square images."""
+    return View(arena, size_px, size_px, _ONBOARD_FOCAL * size_px)
 
 
 def _circle(centre: Floats, normal: Floats, radius: float) -> Floats:

@@ -54,10 +54,8 @@ class Arena:
     def state(self) -> tuple[Floats, Floats, Floats]:
         """Return the drones' positions in their cells, their velocities and their angles. Do not modify the arrays.
 
-        Returns:
-            Positions, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll, pitch and
-            yaw, shape (n, 3) [rad]. Positions and angles are true values, as motion capture would give; velocities are
-            the drones' estimates.
+        Positions, (n, 3) [m], and roll, pitch and yaw, (n, 3) [rad], are true values, as motion capture would give;
+        velocities in the body's levelled axes, (n, 3) [m/s], are the drones' estimates.
         """
         if self._state is None:
             self._state = self.simulation.motions()

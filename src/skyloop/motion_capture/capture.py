@@ -104,17 +104,7 @@ class MotionCapture:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def _open(self, timeout_s: float = 5.0) -> Self:
-        """Connect and wait for the first frame.
-
-        Args:
-            timeout_s: Maximum time to wait [s].
-
-        Raises:
-            LinkError: No frame arrived within ``timeout_s``.
-            MissingExtraError: The extra ``[mocap]`` is not installed.
-            UsageError: A VRPN tracker has several sensors and none was named.
-            UnsupportedError: A simulated drone does not report its true pose.
-        """
+        """Connect and wait for the first frame."""
         self._source.start(timeout_s)
         self._watch.start()
         return self
@@ -267,7 +257,16 @@ class MotionCapture:
         Raises:
             UnknownNameError: ``bodies`` has no such name.
         """
-        return fixes(self, drone)
+        name = drone.name
+        self._track(name)  # raises here for an unknown name
+
+        def newest() -> Fix | None:
+            pose = self.pose(name)
+            if pose is None:
+                return None
+            return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position_m, pose.yaw_rad, pose.velocity_m_s)
+
+        return newest
 
     # Calibration -----------------------------------------------------------------------------------------------
 
@@ -377,11 +376,7 @@ class Linked:
     """Logs each of a drone's poses on the drone until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
-        """Initialise. The ``with`` block starts the logging.
-
-        Raises:
-            UsageError: ``max_hz`` is not between 1 and 1000.
-        """
+        """Initialise. The ``with`` block starts the logging."""
         if not 1.0 <= max_hz <= 1000.0:
             raise UsageError(f"max_hz is {max_hz!r} and must be from 1 to 1000")
         self._capture = capture
@@ -422,21 +417,3 @@ class Linked:
             lost = event.state is TrackState.LOST
             severity = Severity.WARNING if lost else Severity.INFO
             self._drone.log.text(event.text, name=MOCAP, severity=severity)
-
-
-def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
-    """Return a position source for controllers, with a drone's newest pose and its time on the proxy's clock.
-
-    Raises:
-        UnknownNameError: The capture has no body with the drone's name.
-    """
-    name = drone.name
-    capture.state(name)  # raises here for an unknown name
-
-    def newest() -> Fix | None:
-        pose = capture.pose(name)
-        if pose is None:
-            return None
-        return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position_m, pose.yaw_rad, pose.velocity_m_s)
-
-    return newest

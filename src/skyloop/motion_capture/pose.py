@@ -86,11 +86,8 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
     """Convert from axes with y up (x right, y up, z backward, Motive's streaming default) to axes with z up.
 
-    Rotates both world and body a quarter turn about x, so that an upright body stays upright.
-
-    Args:
-        position: [m]
-        quaternion: x, y, z, w.
+    Rotates both world and body a quarter turn about x, so that an upright body stays upright. Quaternions are x, y, z,
+    w.
     """
     x, y, z = position
     qx, qy, qz, qw = quaternion
@@ -104,24 +101,8 @@ def plausible(position: Vector, quaternion: Quaternion) -> bool:
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
 
 
-def matrix(quaternion: Quaternion) -> NDArray[np.float64]:
-    """Return the rotation matrix of a quaternion (x, y, z, w), shape (3, 3), float64."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def scipy_types() -> Any:
-    """Import SciPy's module of rotations and transforms.
-
-    Raises:
-        MissingExtraError: SciPy is not installed or older than 1.16.
-    """
+    """Import SciPy's module of rotations and transforms, of SciPy 1.16 or newer."""
     try:
         from scipy.spatial import transform
 
@@ -239,22 +220,12 @@ class Track:
 
     The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
     by half the window and has much less noise than the difference between two poses.
-
-    Attributes:
-        body: The body's name.
-        state: Whether the body is tracked.
-        pose: The newest pose while the body is tracked, otherwise None.
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body that has not been seen yet.
-
-        Args:
-            body: Name of the body.
-            may_freeze: Whether the pose may stay constant, as in a simulator without noise.
-        """
+        """Initialise a body that has not been seen yet; in a simulator without noise, its pose ``may_freeze``."""
         self.body = body
-        self.state = TrackState.WAITING
+        self.state = TrackState.WAITING  #: whether the body is tracked
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
         self._may_freeze = may_freeze
         self._recent: deque[tuple[int, Vector]] = deque()
@@ -263,16 +234,7 @@ class Track:
         self._last: tuple[Vector, Quaternion] | None = None
 
     def add(self, captured_ns: int, position: Vector, quaternion: Quaternion) -> BodyPose | None:
-        """Update with a new pose.
-
-        Args:
-            captured_ns: Capture time.
-            position: [m]
-            quaternion: x, y, z, w.
-
-        Returns:
-            The pose with its velocity; None if it is no newer than the last one or is frozen.
-        """
+        """Update with a new pose [m; x, y, z, w]; return it with its velocity, or None if not new or frozen."""
         if captured_ns <= self._seen_ns:
             return None
         self._seen_ns = captured_ns

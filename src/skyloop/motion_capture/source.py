@@ -164,14 +164,7 @@ class RawFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 def read(stream: BinaryIO) -> RawFrame | None:
-    """Read the next frame.
-
-    Returns:
-        The frame; None at the end of the stream.
-
-    Raises:
-        msgspec.DecodeError: The data is not a frame.
-    """
+    """Read the next frame; None at the end of the stream, and ``msgspec.DecodeError`` for anything else."""
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
         return None
@@ -207,14 +200,9 @@ def open_output() -> BinaryIO:
 
 
 def main(kind: str, settings: str) -> int:
-    """Connect and write frames until the reader is gone.
+    """Connect and write frames until the reader is gone; ``settings`` is a JSON object for the package's ``connect``.
 
-    Args:
-        kind: The system's name in the ``motioncapture`` package.
-        settings: JSON object of strings for the package's ``connect``.
-
-    Returns:
-        Exit code: 0 when the reader is gone, :data:`MISSING` if the package is missing, 1 for any other error.
+    The exit code is 0 when the reader is gone, :data:`MISSING` if the package is missing, 1 for any other error.
     """
     try:
         import motioncapture
@@ -238,26 +226,13 @@ class TruthSource:
     """Observes the proxies of simulated drones and reads the true poses from their native telemetry."""
 
     def __init__(self, proxies: Iterable[str], take: Callable[[RawFrame], None]) -> None:
-        """Initialise without connecting.
-
-        Args:
-            proxies: Names of the drones' proxies.
-            take: Called with each frame on the thread that receives feedback.
-        """
+        """Initialise without connecting; ``take`` is called with each frame on the thread that receives feedback."""
         self._proxies = tuple(proxies)
         self._take = take
         self._open = ExitStack()
 
     def start(self, timeout_s: float) -> None:
-        """Connect to all proxies.
-
-        Args:
-            timeout_s: Maximum time to wait for each connection [s].
-
-        Raises:
-            UnsupportedError: A vehicle does not report its true pose.
-            SkyloopError: As for :func:`skyloop.connect`.
-        """
+        """Connect to all proxies; UnsupportedError if a vehicle does not report its true pose."""
         from skyloop.client import connect
 
         with ExitStack() as opening:
@@ -283,9 +258,7 @@ class TruthSource:
         return take
 
 
-def true_pose(
-    feedback: Feedback,
-) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
+def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
     """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None if missing."""
     native = feedback.native or {}
     try:
@@ -325,11 +298,8 @@ class ChildSource:
     ) -> None:
         """Initialise without starting the child.
 
-        Args:
-            system: The system to connect to.
-            take: Called with each frame on the reading thread.
-            trouble: Called with a description on one of this object's threads when the child fails.
-            command: The beginning of the child's command line; kind and settings are added to it.
+        ``take`` gets each frame on the reading thread, ``trouble`` a description when the child fails. The system's
+        kind and settings are added to the command.
         """
         self._system = system
         self._take = take
@@ -355,12 +325,7 @@ class ChildSource:
         return None if self._runner.child is None else self._runner.child.pid
 
     def start(self, timeout_s: float) -> None:
-        """Start the child and wait for the first frame.
-
-        Raises:
-            LinkError: No frame arrived within ``timeout_s``.
-            MissingExtraError: The ``motioncapture`` package is not installed.
-        """
+        """Start the child and wait for the first frame."""
         self._runner.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
             failed, last_words = self._failed, self._last_words

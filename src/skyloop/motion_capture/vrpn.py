@@ -50,9 +50,9 @@ MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes; the reference implemen
 MAX_NAMES: Final = 2_000  #: maximum number of senders and of types, as in the reference implementation
 MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 
-_HEADER: Final = struct.Struct(">IIIiiI")
-_NAME_LENGTH: Final = struct.Struct(">I")
-_POSE: Final = struct.Struct(">ii7d")
+HEADER: Final = struct.Struct(">IIIiiI")
+NAME_LENGTH: Final = struct.Struct(">I")
+POSE: Final = struct.Struct(">ii7d")
 _SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
 
 
@@ -78,13 +78,9 @@ class Decoder:
         self._names: dict[int, dict[int, str]] = {SENDER_DESCRIPTION: {}, TYPE_DESCRIPTION: {}}
 
     def feed(self, data: bytes) -> list[TrackerPose]:
-        """Decode the next bytes of the stream.
+        """Decode the next bytes of the stream; return the poses that they complete, in the order sent.
 
-        Returns:
-            The poses completed by these bytes, in the order sent. Everything else is skipped.
-
-        Raises:
-            DecodeError: The bytes are not VRPN, or the server ends the connection. The decoder is unusable afterwards.
+        DecodeError if the bytes are not VRPN or the server ends the connection. The decoder is unusable afterwards.
         """
         self._pending += data
         if not self._greeted:
@@ -98,16 +94,16 @@ class Decoder:
             self._greeted = True
         poses: list[TrackerPose] = []
         at = 0
-        while len(self._pending) - at >= _HEADER.size:
-            length, _, _, sender, kind, _ = _HEADER.unpack_from(self._pending, at)
-            if not _HEADER.size <= length <= _HEADER.size + MAX_PAYLOAD:
+        while len(self._pending) - at >= HEADER.size:
+            length, _, _, sender, kind, _ = HEADER.unpack_from(self._pending, at)
+            if not HEADER.size <= length <= HEADER.size + MAX_PAYLOAD:
                 raise DecodeError(
-                    f"a VRPN message has from {_HEADER.size} to {_HEADER.size + MAX_PAYLOAD} bytes, got {length}"
+                    f"a VRPN message has from {HEADER.size} to {HEADER.size + MAX_PAYLOAD} bytes, got {length}"
                 )
             end = at + length + -length % 8
             if end > len(self._pending):
                 break
-            pose = self._message(sender, kind, bytes(self._pending[at + _HEADER.size : at + length]))
+            pose = self._message(sender, kind, bytes(self._pending[at + HEADER.size : at + length]))
             if pose is not None:
                 poses.append(pose)
             at = end
@@ -123,46 +119,19 @@ class Decoder:
         elif kind == DISCONNECT:
             raise DecodeError("the VRPN server ends the connection")
         elif self._names[TYPE_DESCRIPTION].get(kind) == POS_QUAT and sender in self._names[SENDER_DESCRIPTION]:
-            if len(payload) != _POSE.size:
-                raise DecodeError(f"a VRPN pose has {_POSE.size} bytes, got {len(payload)}")
-            sensor, _, *numbers = _POSE.unpack(payload)
+            if len(payload) != POSE.size:
+                raise DecodeError(f"a VRPN pose has {POSE.size} bytes, got {len(payload)}")
+            sensor, _, *numbers = POSE.unpack(payload)
             x, y, z, qx, qy, qz, qw = numbers
             return TrackerPose(self._names[SENDER_DESCRIPTION][sender], sensor, (x, y, z), (qx, qy, qz, qw))
         return None
 
 
-def encode_message(sender: int, kind: int, payload: bytes, *, seconds: int = 0, microseconds: int = 0) -> bytes:
-    """Encode a message with its padding. The time is that of the report, since 1970."""
-    head = _HEADER.pack(_HEADER.size + len(payload), seconds, microseconds, sender, kind, 0)
-    return head + payload + bytes(-len(payload) % 8)
-
-
-def encode_description(kind: int, number: int, name: str) -> bytes:
-    """Encode the name of the sender (``SENDER_DESCRIPTION``) or type (``TYPE_DESCRIPTION``) with this number."""
-    text = name.encode() + b"\0"
-    return encode_message(number, kind, _NAME_LENGTH.pack(len(text)) + text)
-
-
-def encode_pose(
-    sender: int,
-    kind: int,
-    sensor: int,
-    position: tuple[float, float, float],
-    quaternion: tuple[float, float, float, float],
-    *,
-    seconds: int = 0,
-    microseconds: int = 0,
-) -> bytes:
-    """Encode a pose, where ``kind`` is the number described as ``vrpn_Tracker Pos_Quat``."""
-    payload = _POSE.pack(sensor, sensor, *position, *quaternion)  # the sensor twice, because the reference pads with it
-    return encode_message(sender, kind, payload, seconds=seconds, microseconds=microseconds)
-
-
 def _decode_name(payload: bytes) -> str:
-    if len(payload) < _NAME_LENGTH.size:
-        raise DecodeError(f"a VRPN description has at least {_NAME_LENGTH.size} bytes, got {len(payload)}")
-    (length,) = _NAME_LENGTH.unpack_from(payload)
-    text = payload[_NAME_LENGTH.size : _NAME_LENGTH.size + length]
+    if len(payload) < NAME_LENGTH.size:
+        raise DecodeError(f"a VRPN description has at least {NAME_LENGTH.size} bytes, got {len(payload)}")
+    (length,) = NAME_LENGTH.unpack_from(payload)
+    text = payload[NAME_LENGTH.size : NAME_LENGTH.size + length]
     if not 1 <= length <= MAX_NAME or len(text) < length:
         raise DecodeError(
             f"a name in a VRPN description has from 1 to {MAX_NAME} bytes, got {length} in {len(payload)} bytes"
@@ -189,15 +158,7 @@ class SensorSelection:
     """
 
     def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
-        """Initialise the selection.
-
-        Args:
-            names: Names of the bodies.
-            sensor: Sensor for bodies whose name gives none; None if the address doesn't give one.
-
-        Raises:
-            UsageError: Two names refer to the same sensor.
-        """
+        """Initialise the selection; ``sensor`` is that of bodies whose name gives none."""
         self._bodies: dict[tuple[str, int], str] = {}
         self._unnamed: set[str] = set()  # trackers whose sensor is not named
         self._reported: dict[str, tuple[int, set[int]]] = {}  # their first report and the sensors seen
@@ -214,15 +175,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest pose of each body.
-
-        Args:
-            poses: Poses in order of arrival.
-            now_ns: The time of arrival.
-
-        Returns:
-            Poses by body name; for sensors that don't belong to a body the name is ``TRACKER:SENSOR``.
-        """
+        """Return the newest of some poses in order of arrival for each body; of others by ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
@@ -270,16 +223,9 @@ class VrpnSource:
     def __init__(
         self, system: System, names: Iterable[str], take: Callable[[RawFrame], None], trouble: Callable[[str], None]
     ) -> None:
-        """Initialise without connecting.
+        """Initialise without connecting; names are ``TRACKER`` or ``TRACKER:SENSOR``.
 
-        Args:
-            system: The server's address.
-            names: Names of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
-            take: Called with each frame on the reading thread.
-            trouble: Called with a description of each problem on the reading thread.
-
-        Raises:
-            UsageError: Two names refer to the same sensor.
+        ``take`` gets each frame and ``trouble`` a description of each problem, on the reading thread.
         """
         self._system = system
         self._selection = SensorSelection(names, system.sensor)
@@ -292,12 +238,7 @@ class VrpnSource:
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Connect and wait for the first frame.
-
-        Raises:
-            LinkError: No frame arrived.
-            UsageError: A tracker has several sensors and none was named.
-        """
+        """Connect and wait for the first frame; UsageError if a tracker has several sensors and none was named."""
         self._reader.start()
         ready = self._ready.wait(timeout_s)
         if ready and not self._refused:

@@ -60,14 +60,7 @@ class Group:
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
-        """Start the children.
-
-        Args:
-            command: Command line of each child.
-            count: Number of children.
-            tell: Called on a child's thread with a human-readable text when that child dies.
-            pause_s: Delay before restarting a dead child [s].
-        """
+        """Start so many children; ``tell`` gets a text on a child's thread when that child dies."""
         self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
 
     @property

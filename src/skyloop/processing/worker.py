@@ -1,15 +1,20 @@
-"""A worker of a processor: takes its share of the frames, calls the user's class and publishes the results."""
+"""A processor's class, loaded from a module or file, and the worker that gives it its share of a drone's frames."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import inspect
 import math
+import sys
 import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from types import TracebackType
+from pathlib import Path
+from types import ModuleType, TracebackType
 from typing import Any, Final, Self
 
 import msgspec
@@ -20,10 +25,132 @@ from skyloop.client.frame import Arrival
 from skyloop.client.publishing import Membership
 from skyloop.client.video import VideoChannel
 from skyloop.clock import NS_PER_S, Clock
-from skyloop.errors import UsageError
+from skyloop.control.loading import load_module
+from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.extend import join_processor, video_channel
 from skyloop.messages import ProcessorShare, Severity
 from skyloop.messages.relayed import MAX_LOG_TEXT, Shape
+
+_WANTED: Final = "a class with a method process(self, frame)"
+_DIGITS: Final = 16  #: number of digits of the code's hash
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A processor's class, and a mark that distinguishes it from other code with the same name."""
+
+    kind: type[Any]
+    mark: str  #: name of the class and a hash of the file that defines it
+
+    @classmethod
+    def of(cls, kind: type[Any]) -> Code:
+        """Return the code of a class.
+
+        Raises:
+            UsageError: The class has no plain method ``process(self, frame)``.
+        """
+        _check(kind)
+        digits = hashlib.sha256(_source(kind)).hexdigest()[:_DIGITS]
+        return cls(kind, f"{kind.__qualname__[:100]} {digits}")
+
+    @property
+    def name(self) -> str:
+        """Default name of the processor: the name of the class in lower case."""
+        return self.kind.__name__.lower()[:64]
+
+    def make(self) -> Any:
+        """Create an instance.
+
+        Raises:
+            UsageError: The class needs arguments.
+        """
+        try:
+            inspect.signature(self.kind).bind()
+        except TypeError as error:
+            name = self.kind.__name__
+            raise UsageError(f"{name} can't be made as {name}(): {error}; give its arguments default values") from None
+        return self.kind()
+
+
+def load_processor(target: str) -> Code:
+    """Load a processor's class.
+
+    Args:
+        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if it has only one processor. The current directory
+            is searched for modules too.
+
+    Raises:
+        UsageError: ``target`` names no processor, there is no such module, or the class is not a processor.
+        UnknownNameError: There is no such class.
+        FileFormatError: Loading fails, or the file contains no processor.
+    """
+    place, colon, class_name = target.rpartition(":")
+    if not colon:
+        place, class_name = target, ""
+    if place.endswith(".py"):
+        module = load_module(Path(place), _WANTED)
+    elif colon and place:
+        module = _import(place)
+    else:
+        raise UsageError(f"{target!r} is not a processor: give module:Class, file.py:Class or file.py")
+    return Code.of(_choose(module, class_name, place))
+
+
+def _import(name: str) -> ModuleType:
+    if "" not in sys.path and str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (name == error.name or name.startswith(f"{error.name}.")):
+            raise UsageError(
+                f"there is no module {name} here or on Python's path: give module:Class, or file.py:Class"
+            ) from None
+        raise FileFormatError(f"module {name}: {error}") from error
+    except Exception as error:
+        raise FileFormatError(f"module {name}: {type(error).__name__}: {error}") from error
+
+
+def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
+    """Return the class with that name or, without a name, the only class with a method ``process``."""
+    found = {
+        name: value
+        for name, value in vars(module).items()
+        if inspect.isclass(value) and callable(getattr(value, "process", None))
+    }
+    if class_name:
+        named = getattr(module, class_name, None)
+        if inspect.isclass(named):
+            return named
+        raise UnknownNameError(f"processor in {place}", class_name, found)
+    own = {name: value for name, value in found.items() if value.__module__ == module.__name__} or found
+    if not own:
+        raise FileFormatError(f"{place} has no processor: write {_WANTED}")
+    if len(own) > 1:
+        raise UsageError(f"{place} has several processors ({', '.join(sorted(own))}): choose one with {place}:CLASS")
+    return next(iter(own.values()))
+
+
+def _check(kind: type[Any]) -> None:
+    process = getattr(kind, "process", None)
+    if not callable(process):
+        raise UsageError(f"{kind.__name__} is not a processor: it has no method process(self, frame)")
+    if inspect.iscoroutinefunction(process):
+        raise UsageError(f"{kind.__name__}.process must be a plain function, not a coroutine")
+    try:
+        inspect.signature(process).bind(None, None)
+    except TypeError as error:
+        raise UsageError(f"{kind.__name__}.process must take one frame, as process(self, frame): {error}") from None
+
+
+def _source(kind: type[Any]) -> bytes:
+    """Return the source file of a class or, if there is none (as in a notebook), its compiled code."""
+    try:
+        return Path(inspect.getsourcefile(kind) or "").read_bytes()
+    except (TypeError, OSError):
+        code = getattr(kind.process, "__code__", None)
+        return b"" if code is None else code.co_code + repr(code.co_names).encode()
+
 
 _LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
@@ -219,14 +346,7 @@ class Frames:
     def __init__(
         self, drone: Drone, membership: Membership, came: Callable[[], None], *, max_fps: float | None = None
     ) -> None:
-        """Prepare to subscribe.
-
-        Args:
-            drone: Source of the frames.
-            membership: The membership that has the share.
-            came: Called on the receiving thread for each frame in the share.
-            max_fps: Frame rate limit; None for no limit.
-        """
+        """Prepare to subscribe; ``came`` is called on the receiving thread for each frame in the membership's share."""
         self._drone = drone
         self._membership = membership
         self._came = came
@@ -369,24 +489,12 @@ class Tally:
         self._came.append(self._clock())
 
     def made(self, age_s: float, took_s: float) -> None:
-        """Count a published result.
-
-        Args:
-            age_s: Time since the frame's capture [s].
-            took_s: Duration of ``process`` [s].
-        """
+        """Count a published result, with the time since the frame's capture and the duration of ``process``."""
         self.results += 1
         self._made.append((self._clock(), age_s, took_s))
 
     def status(self, processor: str, camera: str, share: ProcessorShare | None, dropped: int) -> Status:
-        """Return the current statistics.
-
-        Args:
-            processor: Name of the processor.
-            camera: Name of the camera.
-            share: The worker's share of the frames; None if unknown.
-            dropped: Number of frames replaced by newer ones.
-        """
+        """Return the current statistics; ``dropped`` frames were replaced by newer ones."""
         since_ns = self._clock() - NS_PER_S
         made = [one for one in self._made.copy() if one[0] > since_ns]
         ages, took = sorted(age for _, age, _ in made), sorted(took for _, _, took in made)

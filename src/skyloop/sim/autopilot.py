@@ -26,12 +26,11 @@ from skyloop.messages import (
 )
 from skyloop.messages.geometry import clamped
 from skyloop.sim.collisions import Contacts
-from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.control_loops import ControlLoops, Sensors
 from skyloop.sim.dynamics import column
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.rotors import RotorBodies
-from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
 
 
@@ -92,20 +91,15 @@ def next_state(state: FlightState, happening: Happening) -> FlightState | None:
 
 
 class Batteries:
-    """The drones' batteries.
-
-    Attributes:
-        charge: Remaining charge, 0 to 1, (n,).
-        voltage: Voltage at the terminals, (n,) [V].
-    """
+    """The drones' batteries."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], charge: Floats) -> None:
-        self.charge = charge.copy()
+        self.charge = charge.copy()  #: remaining charge, 0 to 1, (n,)
         self._capacity = column(parameters, lambda p: p.battery_charge_c)
         self._full = column(parameters, lambda p: p.battery_full_v)
         self._empty = column(parameters, lambda p: p.battery_empty_v)
         self._resistance = column(parameters, lambda p: p.battery_resistance_ohm)
-        self.voltage = self.open_voltage()
+        self.voltage = self.open_voltage()  #: voltage at the terminals, (n,) [V]
 
     def drain(self, power: Floats, period_s: float) -> None:
         """Discharge the batteries by ``power``, (n,) [W], over a period."""

@@ -44,26 +44,17 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """The pose of a camera in the world.
+    """The pose of a camera in the world."""
 
-    Attributes:
-        position_m: Position of the optical centre, shape (3,).
-        rotation: Rotation from optical to world axes, shape (3, 3).
-        drone: Number of the drone that carries the camera and is not rendered itself; None for a free camera.
-    """
-
-    position_m: NDArray[np.float64]
-    rotation: NDArray[np.float64]
+    position_m: NDArray[np.float64]  #: position of the optical centre, shape (3,)
+    rotation: NDArray[np.float64]  #: rotation from optical to world axes, shape (3, 3)
+    #: number of the drone that carries the camera and is not rendered itself; None for a free camera
     drone: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A camera mounted on a drone.
-
-    Raises:
-        UsageError: A value is out of its range.
-    """
+    """A camera mounted on a drone."""
 
     name: str
     width: int  #: width of the image [px]
@@ -85,14 +76,11 @@ class CameraModel:
     def __post_init__(self) -> None:
         if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
             raise UsageError(f"camera {self.name!r}: {self.width}x{self.height} pixels; sides must be 1 to 8192")
-        positive = {"fps": self.fps, "fx": self.fx, "fy": self.fy, "exposure_gain": self.exposure_gain}
-        for what, value in positive.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and above 0")
-        not_negative = {"latency_s": self.latency_s, "noise_sigma": self.noise_sigma, "exposure_s": self.exposure_s}
-        for what, value in not_negative.items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and not negative")
+        for what in ("fps", "fx", "fy", "exposure_gain", "latency_s", "noise_sigma", "exposure_s"):
+            value, may_be_zero = getattr(self, what), what in ("latency_s", "noise_sigma", "exposure_s")
+            if not (0.0 < value < math.inf or (may_be_zero and value == 0.0)):
+                allowed = "not negative" if may_be_zero else "above 0"
+                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and {allowed}")
         if not 0.0 <= self.vignetting <= 1.0:
             raise UsageError(f"camera {self.name!r}: vignetting is {self.vignetting}; it must be from 0 to 1")
         if not np.isfinite([self.cx, self.cy, *self.distortion, *self.position_m]).all():
@@ -113,11 +101,11 @@ class CameraModel:
 
     @property
     def distorted(self) -> bool:
-        """Return the intrinsics, as given with each frame."""
+        """Whether the lens bends straight lines."""
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """Return the camera's description as drivers report it before the first frame."""
+        """Return the intrinsics, as given with each frame."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 
@@ -136,22 +124,12 @@ class CameraModel:
     def pose(
         self, body_position_m: NDArray[np.float64], body_rotation: NDArray[np.float64], drone: int | None = None
     ) -> CameraPose:
-        """Return the camera's pose for a pose of its drone.
-
-        Args:
-            body_position_m: Position of the body in world axes, shape (3,).
-            body_rotation: Rotation from body to world axes, shape (3, 3).
-            drone: Number of the drone that carries the camera.
-        """
+        """Return the camera's pose for its drone's position (3,) and rotation (3, 3), world from body."""
         position = np.asarray(body_position_m, dtype=np.float64) + body_rotation @ np.asarray(self.position_m)
         return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
 
     def scaled(self, factor: float) -> CameraModel:
-        """Return the same lens with a different image size: a factor of 2 turns 320×240 into 640×480.
-
-        Raises:
-            UsageError: The factor is not a finite number greater than 0.
-        """
+        """Return the same lens with a different image size: a factor of 2 turns 320×240 into 640×480."""
         if not (math.isfinite(factor) and factor > 0.0):
             raise UsageError(f"a camera can't be scaled by {factor}; the factor must be finite and above 0")
         return replace(
@@ -165,14 +143,7 @@ class CameraModel:
         )
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project points into the image.
-
-        Args:
-            points: Points in optical axes [m], shape (n, 3), all in front of the camera (z > 0).
-
-        Returns:
-            Pixels, shape (n, 2).
-        """
+        """Project points (n, 3) in optical axes [m], all in front of the camera (z > 0), to pixels (n, 2)."""
         points = np.asarray(points, dtype=np.float64)
         bent = distort(points[:, :2] / points[:, 2:], self.distortion)
         return bent * (self.fx, self.fy) + (self.cx, self.cy)

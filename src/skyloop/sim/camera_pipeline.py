@@ -6,6 +6,7 @@ import heapq
 import itertools
 import math
 import threading
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -30,16 +31,6 @@ class Screen(Protocol):
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
 
     def failed(self, error: Exception) -> None: ...
-
-
-class Exposing(Protocol):
-    """Renders exposures and delivers the frames when they are due."""
-
-    def expose(self, exposures: list[Exposure]) -> None: ...
-
-    def forget(self, cameras: tuple[Camera, ...]) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 class Shutter:
@@ -74,12 +65,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether the exposure that is due now is worth rendering.
-
-        Args:
-            captured_ns: Time of the exposure.
-            fps: Number of frames per second in use: 0 for none, infinity for all.
-        """
+        """Return whether the exposure due now is worth rendering for so many frames per second (or infinitely many)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -107,13 +93,21 @@ class Exposure:
     due_ns: int  #: time at which to deliver the frame
 
 
-class _Frames:
-    """Rendered frames, each delivered when it is due."""
+class Pipeline(ABC):
+    """Renders exposures and delivers each frame when it is due."""
 
     def __init__(self) -> None:
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
         self._order = itertools.count()
         self._handing = threading.RLock()
+
+    @abstractmethod
+    def expose(self, exposures: list[Exposure]) -> None:
+        """Render exposures."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End. Undelivered frames are lost."""
 
     def hand_out(self, now_ns: int) -> None:
         """Deliver the frames that are due by now."""
@@ -135,20 +129,14 @@ class _Frames:
         heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
 
 
-class CameraPipeline(_Frames):
+class CameraPipeline(Pipeline):
     """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
     Creating the scene takes some tenths of a second, so start the pipeline when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
-        """Initialise without starting the thread.
-
-        Args:
-            world: The world.
-            drones: Number of drones.
-            quality: Image quality: ``fast``, ``smooth`` or ``best``.
-        """
+        """Initialise without starting the thread; ``quality`` is ``fast``, ``smooth`` or ``best``."""
         super().__init__()
         self._world = world
         self._drones = drones
@@ -210,7 +198,7 @@ class CameraPipeline(_Frames):
                     self._changed.wait(wait_s)
 
 
-class SteppedCameraPipeline(_Frames):
+class SteppedCameraPipeline(Pipeline):
     """Renders each exposure immediately and delivers due frames on request, all on one thread.
 
     Intended for a world whose time advances only in explicit steps.

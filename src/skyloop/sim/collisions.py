@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyloop.messages.geometry import clamped
-from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
-from skyloop.sim.dynamics import STEP_S, BodyTable, column
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, STEP_S, BodyTable, N, Operations, column, few
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
@@ -32,50 +31,32 @@ FEW_PAIRS = 6
 
 @dataclass(slots=True)
 class Contacts:
-    """The contacts in a step.
+    """The contacts in a step."""
 
-    Attributes:
-        standing: Drones supported from below by something other than a drone.
-        upon: Pairs of a drone standing on another, the upper one first.
-        impacts: Drone, speed along the normal [m/s], and the name of the other object.
-    """
-
-    standing: set[int] = field(default_factory=set)
+    standing: set[int] = field(default_factory=set)  #: drones supported from below by something other than a drone
+    #: pairs of a drone standing on another, the upper one first
     upon: list[tuple[int, int]] = field(default_factory=list)
+    #: drone, speed along the normal [m/s], and the name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class _Near:
-    """Everything that is within the drones' reach until the next broad phase.
+    """Everything that is within the drones' reach until the next broad phase."""
 
-    Attributes:
-        one: The first drone of each pair of drones within reach; it has the lower number.
-        other: The second drone of each pair.
-        across: The square of the sum of the pair's radii.
-        upright: The square of the sum of the pair's half heights.
-        solids: The solids within reach, by drone; drones that are only near a wall or the ceiling have none.
-        who: Number of the drone in each pair of a drone and a solid.
-        what: Number of the solid in each of these pairs.
-        sizes: Sizes of the solids; see :meth:`Solids.sizes`.
-        moving: Whether one of these solids is moving.
-        walled: Drones that can reach a wall or the ceiling.
-        room_low: Minimum coordinates of the centres of those drones, (3, walled).
-        room_high: Maximum coordinates.
-    """
-
-    one: Indices
-    other: Indices
-    across: Floats
-    upright: Floats
+    one: Indices  #: the first drone of each pair of drones within reach; it has the lower number
+    other: Indices  #: the second drone of each pair
+    across: Floats  #: the square of the sum of the pair's radii
+    upright: Floats  #: the square of the sum of the pair's half heights
+    #: the solids within reach, by drone; drones that are only near a wall or the ceiling have none
     solids: dict[int, list[int]]
-    who: Indices
-    what: Indices
-    sizes: Floats
-    moving: bool
-    walled: Indices
-    room_low: Floats
-    room_high: Floats
+    who: Indices  #: number of the drone in each pair of a drone and a solid
+    what: Indices  #: number of the solid in each of these pairs
+    sizes: Floats  #: sizes of the solids; see :meth:`Solids.sizes`
+    moving: bool  #: whether one of these solids is moving
+    walled: Indices  #: drones that can reach a wall or the ceiling
+    room_low: Floats  #: minimum coordinates of the centres of those drones, (3, walled)
+    room_high: Floats  #: maximum coordinates
 
 
 class Collisions:
@@ -283,8 +264,7 @@ class Collisions:
     def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
         """Remove the velocity into the surface and apply friction.
 
-        Returns:
-            The velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
+        Return the velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
         """
         vx, vy, vz = self._bodies.velocity[:, drone].tolist()
         nx, ny, nz = overlap.normal

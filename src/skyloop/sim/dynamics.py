@@ -1,6 +1,8 @@
 """Dynamics of quadrotors and wind in fixed steps, for many drones at once as array columns or for a few one by one.
 
-Both give the same bits, as ``tests/sim/test_columns.py`` checks.
+NumPy takes as long for three numbers as for three hundred. A few drones are therefore faster one by one in plain
+floats, and many drones together in arrays. Both give the same bits, because they do the same operations in the same
+order and both use NumPy's sines and cosines; ``tests/sim/test_columns.py`` checks it.
 """
 
 from __future__ import annotations
@@ -8,13 +10,58 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from struct import Struct
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose
 from skyloop.sim.world import Wind
+
+N: TypeAlias = Any  #: a number for one drone, or an array with one for each
+FEW = 3  #: maximum number of drones that are computed one by one
+
+
+def few(drones: int) -> bool:
+    """Return whether this number of drones is computed one by one."""
+    return drones <= FEW
+
+
+def columns(rows: int, drones: int) -> Floats:
+    """Return zeros of shape (rows, drones), in the memory layout for this number of drones."""
+    return np.zeros((drones, rows)).T if few(drones) else np.zeros((rows, drones))
+
+
+class Fields:
+    """Consecutive rows of an array made by :func:`columns`, as plain floats for a few drones."""
+
+    def __init__(self, table: Floats, first: int, count: int) -> None:
+        rows, drones = table.shape
+        memory = memoryview(table.T).cast("B")  # type: ignore[arg-type]
+        offsets = [(drone * rows + first) * table.itemsize for drone in range(drones)]
+        numbers = Struct(f"{count}d")
+        #: one function per drone that returns the drone's numbers
+        self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
+        #: one function per drone that replaces its numbers; it takes as many numbers
+        self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
+
+
+@dataclass(frozen=True, slots=True)
+class Operations:
+    """Operations that differ between numbers and arrays, so that one formula works for both."""
+
+    least: Callable[[N, N], N]  #: the smaller of two values
+    most: Callable[[N, N], N]  #: the larger of two values
+    root: Callable[[N], N]  #: the square root
+    choose: Callable[[N, N, N], N]  #: the second value where the first is true, otherwise the third
+
+
+NUMBERS: Final = Operations(min, max, math.sqrt, lambda condition, one, other: one if condition else other)
+ARRAYS: Final = Operations(np.minimum, np.maximum, np.sqrt, np.where)
+
 
 STEP_S = 0.004  # time step of the simulation (250 Hz)
 
@@ -31,35 +78,22 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
 
 
 class BodyTable(ABC):
-    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones.
+    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones."""
 
-    Attributes:
-        position: Position of the body's centre, world axes, (3, n) [m].
-        velocity: Velocity of the body's centre, world axes, (3, n) [m/s].
-        velocity_before: Velocity before the last step.
-        angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
-        rates: Derivatives of the angles.
-        sin: Sines of the angles.
-        cos: Cosines of the angles.
-        thrust: Thrust per mass, (n,) [m/s²].
-        attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
-        thrust_command: Input: thrust per mass, (n,).
-        air: Input: velocity of the air, (3, n).
-        commands: For a few drones: the inputs attitude_command and thrust_command.
-        turned: For a few drones: sine of yaw; cosines of roll, pitch, yaw.
-        moved: For a few drones: height of the centre [m], velocity [m/s].
-        most_acceleration_m_s2: Upper bound of every body's acceleration, excluding collisions.
-    """
-
+    #: Upper bound of every body's acceleration, excluding collisions.
     most_acceleration_m_s2 = 60.0  # more than thrust, gravity and drag in a headwind of 10 m/s combined
 
     def __init__(self, positions: Floats, yaws: Floats) -> None:
         n = len(yaws)
         table = columns(_ROWS, n)
         self._table = table
+        #: Roll, pitch, yaw, (3, n) [rad], yaw not wrapped; derivatives; input: roll, pitch [rad], yaw rate [rad/s].
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
+        #: Input and actual value: thrust per mass, (n,) [m/s²].
         self.thrust_command, self.thrust = table[12], table[22]
+        #: Sines and cosines of the angles; input: velocity of the air, (3, n) [m/s].
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
+        #: Position and velocity of the body's centre in world axes, (3, n) [m, m/s]; velocity before the last step.
         self.position, self.velocity, self.velocity_before = (table[row : row + 3] for row in (23, 26, 29))
         self.position[:] = positions
         self.angles[2] = yaws
@@ -67,6 +101,7 @@ class BodyTable(ABC):
         np.cos(self.angles, out=self.cos)
         self._few = few(n)
         if self._few:
+            #: Inputs attitude_command, thrust_command; sine of yaw, cosines of roll, pitch, yaw; height, velocity.
             self.commands, self.turned, self.moved = Fields(table, 9, 4), Fields(table, 15, 4), Fields(table, 25, 4)
 
     @abstractmethod
@@ -349,13 +384,7 @@ class Bodies(BodyTable):
 
 
 def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
-    """Return the angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
-
-    Args:
-        rates: Rates of roll, pitch, yaw: three numbers, or three arrays.
-        sin: Sines of roll, pitch, yaw.
-        cos: Cosines of roll, pitch, yaw.
-    """
+    """Return the angular velocities about a body's axes [rad/s] from its Euler angles' rates, sines and cosines."""
     roll_rate, pitch_rate, yaw_rate = rates
     sin_roll, sin_pitch, _ = sin
     cos_roll, cos_pitch, _ = cos

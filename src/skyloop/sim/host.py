@@ -19,7 +19,7 @@ from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.camera_pipeline import Camera, Exposing, Screen
+    from skyloop.sim.camera_pipeline import Camera, Pipeline, Screen
 
 TICK_S: Final = 0.008  #: simulated time per batch of steps
 
@@ -52,26 +52,12 @@ class SimHost:
     """Several drones in one world, numbered from 0, each with one :class:`Observer`: a driver or emulated firmware.
 
     The world is stepped while at least one observer is attached.
-
-    Attributes:
-        options: Options of the world and its drones.
-        wind: The current wind.
-        simulation: The simulation of the world.
     """
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
-        """Load the world and place the drones in it.
-
-        Args:
-            options: Options of the world and its drones; None for the defaults.
-            drones: Number of drones.
-
-        Raises:
-            UsageError: The world has no room for that many drones.
-            UnknownNameError: There is no such world.
-            FileFormatError: The world's file is invalid.
-        """
-        self.options = options or SimOptions()
+        """Load the world and place the drones in it."""
+        self.drones = drones
+        self.options = options or SimOptions()  #: options of the world and its drones
         world = self.options.load_world()
         self.wind = self.options.blowing(world.wind)  #: the current wind
         self.simulation = Simulation(
@@ -84,13 +70,9 @@ class SimHost:
         )
         self.stepping = threading.Lock()  #: held by the stepping thread: an ending one may still be in a step
         self._lock = threading.Lock()
-        self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never modified
+        #: Observers and cameras by drone; replaced as a whole, never modified.
+        self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
         self._stepper: Stepper | None = None
-
-    @property
-    def drones(self) -> int:
-        """Number of drones."""
-        return self.simulation.drones
 
     def set_wind(self, wind: Wind) -> None:
         """Change the wind for all drones."""
@@ -100,55 +82,38 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Args:
-            drone: The drone's number.
-            observer: Receives reports on the thread that steps the world.
-            screen: Receives the cameras' frames on the rendering thread.
-            models: The drone's cameras.
-
-        Returns:
-            The cameras.
-
-        Raises:
-            UsageError: There is no such drone, or it already has an observer.
-            MissingExtraError: Cameras are requested, but their renderer's libraries are not installed.
+        Reports come on the thread that steps the world, and the cameras' frames, for ``screen``, on the rendering
+        thread. A drone has one observer: for a second one this raises UsageError.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
-            if drone in self._observers:
+            if drone in self.observers:
                 raise UsageError(f"drone {drone} of this world is taken already")
             cameras = self._cameras(drone, screen, models)
-            self._observers = {**self._observers, drone: (observer, cameras)}
+            self.observers = {**self.observers, drone: (observer, cameras)}
             if self._stepper is None:
                 self._stepper = self._make_stepper()
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer. No report is running when this returns. The last observer stops the world.
+        """Stop reporting to an observer; any other than the attached one is ignored. The last one stops the world.
 
-        Args:
-            drone: The drone's number.
-            observer: The attached observer; any other one is ignored.
+        No report is running when this returns.
         """
         with self._lock:
-            entry = self._observers.get(drone)
+            entry = self.observers.get(drone)
             stepper = self._stepper
             if entry is None or entry[0] is not observer or stepper is None:
                 return
-            self._observers = {n: other for n, other in self._observers.items() if n != drone}
-            last = not self._observers
+            self.observers = {n: other for n, other in self.observers.items() if n != drone}
+            last = not self.observers
             if last:
                 self._stepper = None
         if last:
             stepper.stop()
         else:
             stepper.forget(entry[1])
-
-    @property
-    def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
-        """Observers and cameras by drone."""
-        return self._observers
 
     def _make_stepper(self) -> Stepper:
         return _RealTimeStepper(self)
@@ -179,25 +144,16 @@ class Stepper(Protocol):
 class ReportPublisher:
     """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
 
-    def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
-        """Initialise the publisher.
-
-        Args:
-            host: The observers' host.
-            make_pipeline: Creates the camera pipeline when the first frame is requested.
-        """
-        self.pipeline: Exposing | None = None  #: created when the first frame is requested
+    def __init__(self, host: SimHost, make_pipeline: Callable[[], Pipeline]) -> None:
+        """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""
+        self.pipeline: Pipeline | None = None  #: created when the first frame is requested
         self._host = host
         self._make_pipeline = make_pipeline
         self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish the reports and exposures that are due.
-
-        Args:
-            captured_ns: Time of the simulation's state on the observers' clock.
-        """
+        """Publish the reports and exposures that are due for the state at a time on the observers' clock."""
         simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
             if occurrence.drone in observers:
@@ -287,7 +243,7 @@ class _RealTimeStepper:
         for drone, (observer, _) in self._host.observers.items():
             observer.happened(Occurrence(OccurrenceKind.SLOW, drone, self._simulation.time_s, text))
 
-    def _start_pipeline(self) -> Exposing:
+    def _start_pipeline(self) -> Pipeline:
         from skyloop.sim.camera_pipeline import CameraPipeline
 
         options = self._host.options

@@ -149,14 +149,7 @@ _SATELLITES = 14
 
 
 class Instruments:
-    """A drone's instruments, each with its own stream of random numbers.
-
-    Args:
-        vehicle: The drone, with rotors.
-        drone: The drone's number.
-        seed: The simulation's seed.
-        ranging: Function that measures distances to the surroundings.
-    """
+    """A drone's instruments, each with its own stream of random numbers."""
 
     def __init__(self, vehicle: VehicleParameters, drone: int, seed: int, ranging: Ranging) -> None:
         errors = self._errors = rotors_of(vehicle).instruments

@@ -17,9 +17,9 @@ from skyloop.errors import UsageError
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
-from skyloop.sim.render.base import Image
 from skyloop.sim.render.painter import Raster
-from skyloop.sim.render.visibility import DepthBuffer, visible_quads
+from skyloop.sim.render.quads import Image
+from skyloop.sim.render.shading import DepthBuffer, visible_quads
 from skyloop.sim.solids import Solids
 from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
@@ -32,29 +32,18 @@ _LONGEST_STEP_S = 20.0  # maximum time between two images of ``pictures``; track
 
 @dataclass(frozen=True, slots=True)
 class TargetBox:
-    """An object's box in an image.
+    """An object's box in an image."""
 
-    Attributes:
-        name: Name of the target or box in the world.
-        class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
-        box: x, y of the upper left corner, width and height [px] of the object's whole extent within the image.
-        visible: Fraction of the object's pixels within the image that are not occluded, 0 to 1.
-        cut: Whether the image's edge may cut the object off, because it reaches the outermost pixels.
-    """
-
-    name: str
-    class_name: str
+    name: str  #: name of the target or box in the world
+    class_name: str  #: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``
+    #: x, y of the upper left corner, width and height [px] of the object's whole extent within the image
     box: tuple[int, int, int, int]
-    visible: float
-    cut: bool
+    visible: float  #: fraction of the object's pixels within the image that are not occluded, 0 to 1
+    cut: bool  #: whether the image's edge may cut the object off, because it reaches the outermost pixels
 
 
 class Labeller:
-    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time.
-
-    Args:
-        scene: The scene.
-    """
+    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -68,16 +57,7 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first.
-
-        Args:
-            state: The poses of all moving objects.
-            pose: The camera's pose.
-            model: The camera's model.
-
-        Raises:
-            UsageError: The state does not fit the scene, or the model's distortion can't be inverted.
-        """
+        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first."""
         raster = Raster.of(model, 1)
         posed = self._scene.posed(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
@@ -106,34 +86,21 @@ class Labeller:
         return tuple(found)
 
 
-def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-    """Return the box of every target and crate with a pixel in the image, as :meth:`Labeller.boxes` does."""
-    return Labeller(scene).boxes(state, pose, model)
-
-
 def pictures(
-    world: World,
-    seed: int,
-    count: int,
-    size: tuple[int, int] = (320, 240),
-    focal_share: float = 0.75,
+    world: World,  # the world
+    seed: int,  # seed of the positions and times
+    count: int,  # number of images
+    size: tuple[int, int] = (320, 240),  # width and height of the images [px]
+    focal_share: float = 0.75,  # focal length as a fraction of the width
     *,
+    # camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out
     camera: CameraModel | None = None,
-    tilt_rad: float | None = None,
+    tilt_rad: float | None = None,  # maximum random pitch and roll, in either direction
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
     """Yield labelled images of a world from random positions at random times.
 
     Cameras are 0.7 to 3 m high and outside of solids; two thirds of them look roughly at a target. Pitch is at most 15°
     and roll is small, unless ``tilt_rad`` sets both.
-
-    Args:
-        world: The world.
-        seed: Seed of the positions and times.
-        count: Number of images.
-        size: Width and height of the images [px].
-        focal_share: Focal length as a fraction of the width.
-        camera: Camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out.
-        tilt_rad: Maximum random pitch and roll, in either direction.
 
     Raises:
         UsageError: An argument is out of its range, or the world has no room for a camera.
@@ -161,11 +128,7 @@ def pictures(
 
 
 def _camera(
-    world: World,
-    solids: Solids,
-    targets: tuple[TargetState, ...],
-    rng: np.random.Generator,
-    tilt_rad: float | None,
+    world: World, solids: Solids, targets: tuple[TargetState, ...], rng: np.random.Generator, tilt_rad: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     half_x, half_y, top = world.room.size_m[0] / 2, world.room.size_m[1] / 2, world.room.size_m[2]
     hull = np.full((3, 1), _CLEAR_M)

@@ -24,53 +24,29 @@ MOST_LAG_S: Final = 0.25  #: default for the lag behind the clock beyond which s
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """Options for a simulated world and its drones.
+    """Options for a simulated world and its drones."""
 
-    Attributes:
-        world: Name of a built-in world, or path of a world file.
-        seed: Seed for all noise and gusts.
-        speed: Ratio of simulated to real time.
-        cameras: The cameras of each drone.
-        noise: Factor on the sensors' noise and biases.
-        wind: Factor on the world's wind.
-        battery: Charge at the start, 0 to 1.
-        quality: Image quality: ``fast``, ``smooth`` or ``best``.
-        native: Actions that the drone's driver supports natively.
-        position: Whether the drone reports its position.
-        velocity: Whether the drone reports its velocity, which it always uses for its own flight.
-        truth: Whether the drone also reports its true state.
-        rate_hz: Number of reports per second.
-        most_lag_s: Maximum lag of the world behind the clock before it skips steps [s].
-        parameters: The vehicles' parameters.
-        autopilot: Real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
-        autopilot_folder: Folder for the firmware's settings; None to keep them only as long as the drone exists.
-    """
-
-    world: str = "room"
-    seed: int = 0
-    speed: float = 1.0
+    world: str = "room"  #: name of a built-in world, or path of a world file
+    seed: int = 0  #: seed for all noise and gusts
+    speed: float = 1.0  #: ratio of simulated to real time
     cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
-    noise: float = 1.0
-    wind: float = 1.0
-    battery: float = 1.0
-    quality: str = "smooth"
-    native: frozenset[str] = EVERY_ACTION
-    position: bool = True
-    velocity: bool = True
-    truth: bool = True
-    rate_hz: float = 40.0
-    most_lag_s: float = MOST_LAG_S
+    noise: float = 1.0  #: factor on the sensors' noise and biases
+    wind: float = 1.0  #: factor on the world's wind
+    battery: float = 1.0  #: charge at the start, 0 to 1
+    quality: str = "smooth"  #: image quality: ``fast``, ``smooth`` or ``best``
+    native: frozenset[str] = EVERY_ACTION  #: actions that the drone's driver supports natively
+    position: bool = True  #: whether the drone reports its position
+    velocity: bool = True  #: whether the drone reports its velocity, which it always uses for its own flight
+    truth: bool = True  #: whether the drone also reports its true state
+    rate_hz: float = 40.0  #: number of reports per second
+    most_lag_s: float = MOST_LAG_S  #: maximum lag of the world behind the clock before it skips steps [s]
     parameters: VehicleParameters = STANDARD_VEHICLE
-    autopilot: str | None = None
+    autopilot: str | None = None  #: real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``
+    #: folder for the firmware's settings; None to keep them only as long as the drone exists
     autopilot_folder: str | None = None
 
     def load_world(self) -> World:
-        """Load the world.
-
-        Raises:
-            UnknownNameError: There is no such world.
-            FileFormatError: The world's file is invalid.
-        """
+        """Load the world."""
         return load_world(self.world, self.seed)
 
     def blowing(self, wind: Wind) -> Wind:
@@ -121,11 +97,7 @@ class Pacer:
         self.lost_s = 0.0  # clock time skipped so far
 
     def run_due(self) -> float:
-        """Run the steps that are due, in batches.
-
-        Returns:
-            The time until the next step [s]; 0 if one is due already.
-        """
+        """Run the steps that are due, in batches; return the time until the next step [s], 0 if one is due already."""
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
             return -behind / NS_PER_S
@@ -142,14 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Convert a simulation time to the clock using the current deadlines.
-
-        Args:
-            time_s: Simulation time since this pacer's start.
-
-        Returns:
-            The clock's time when the simulation reached, or will reach, that time.
-        """
+        """Return when the simulation reached, or will reach, a time since this pacer's start, on the clock."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:
@@ -157,11 +122,7 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure.
-
-    Args:
-        now_ns: Start of the simulation.
-    """
+    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure."""
 
     def __init__(self, now_ns: int) -> None:
         self._since_ns = now_ns
@@ -169,12 +130,7 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None.
-
-        Args:
-            lost_s: Time skipped so far.
-            now_ns: The current time.
-        """
+        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None

@@ -33,9 +33,6 @@ class InstrumentParameters:
 
     ``noise`` is the standard deviation of a sample. ``bias`` is that of the error at the start of a flight, which then
     wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
-
-    Raises:
-        UsageError: A value is not finite, negative, or zero where it must be positive.
     """
 
     gyro_noise_rad_s: float = 0.002
@@ -74,40 +71,24 @@ class RotorParameters:
     A rotor turning at ω produces the thrust ``thrust_n_s2`` ω² and a torque of ``torque_m`` times that. It follows its
     command with a first-order lag. A command of 0 stops it; above 0, its speed is between ``idle_speed_rad_s`` and
     ``full_speed_rad_s`` in proportion. Both speeds are for a full battery and decrease with the voltage.
-
-    Attributes:
-        places_m: Positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
-        inertia_kg_m2: Moments of inertia about the body's axes.
-        thrust_n_s2: Thrust per speed squared.
-        torque_m: Torque per thrust.
-        idle_speed_rad_s: Lowest speed of a running rotor.
-        full_speed_rad_s: Speed at full command.
-        speed_up_s: Time constant of an accelerating rotor.
-        speed_down_s: Time constant of a decelerating rotor.
-        rotor_drag_kg: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors'
-            speeds. Its causes are blade flapping and the blades' asymmetric drag.
-        rotor_inflow_kg: The same along the rotors' axes, where air from above reduces the thrust.
-        body_drag_kg_m: Force per airspeed squared, along the body's axes.
-        rotor_inertia_kg_m2: Inertia of a rotor about its axis: an accelerating rotor turns the body the other way.
-        efficiency: Fraction of the battery's power that reaches the air as the shafts' torque times speed.
-        instruments: Errors of the instruments.
-
-    Raises:
-        UsageError: A value is not finite or out of its range, or the rotors do not surround the centre of mass.
     """
 
+    #: positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`
     places_m: Places
-    inertia_kg_m2: Vec3
-    thrust_n_s2: float
-    torque_m: float
-    idle_speed_rad_s: float
-    full_speed_rad_s: float
-    speed_up_s: float
-    speed_down_s: float
+    inertia_kg_m2: Vec3  #: moments of inertia about the body's axes
+    thrust_n_s2: float  #: thrust per speed squared
+    torque_m: float  #: torque per thrust
+    idle_speed_rad_s: float  #: lowest speed of a running rotor
+    full_speed_rad_s: float  #: speed at full command
+    speed_up_s: float  #: time constant of an accelerating rotor
+    speed_down_s: float  #: time constant of a decelerating rotor
+    #: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. Its causes
+    #: are blade flapping and the blades' asymmetric drag.
     rotor_drag_kg: float
-    rotor_inflow_kg: float
-    body_drag_kg_m: Vec3
-    efficiency: float
+    rotor_inflow_kg: float  #: the same along the rotors' axes, where air from above reduces the thrust
+    body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
+    efficiency: float  #: fraction of the battery's power that reaches the air as the shafts' torque times speed
+    #: inertia of a rotor about its axis: an accelerating rotor turns the body the other way
     rotor_inertia_kg_m2: float = 0.0
     instruments: InstrumentParameters = field(default_factory=InstrumentParameters)
 
@@ -160,11 +141,7 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameters:
-    """A vehicle's body, motors, loops, battery and sensors.
-
-    Raises:
-        UsageError: A value is not finite, negative, or zero although it is used as a divisor.
-    """
+    """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
     mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
@@ -303,11 +280,7 @@ def _scaled_flaws(parameters: VehicleParameters | InstrumentParameters, factor: 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits to which a vehicle's set-points are clamped. Defaults: AR.Drone, indoor [S].
-
-    Raises:
-        UsageError: A value is out of its range.
-    """
+    """Limits to which a vehicle's set-points are clamped. Defaults: AR.Drone, indoor [S]."""
 
     tilt_rad: float = 0.21
     climb_m_s: float = 0.7

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import N, Operations
+from skyloop.sim.dynamics import N, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, VehicleParameters
 
 PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
@@ -95,11 +95,7 @@ class Constants:
 
 
 def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
-    """Return a vehicle's rotors.
-
-    Raises:
-        UsageError: The vehicle has none, because its response is modelled as a whole.
-    """
+    """Return a vehicle's rotors; UsageError if it has none, because its response is modelled as a whole."""
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
     return vehicle.rotors
@@ -110,12 +106,11 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     rotors = rotors_of(vehicle)
     ix, iy, iz = rotors.inertia_kg_m2
     mass, k = vehicle.mass_kg, rotors.thrust_n_s2
-    (x1, y1), (x2, y2), (x3, y3), (x4, y4) = rotors.places_m
+    xs, ys = zip(*rotors.places_m, strict=True)
     # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
-    rows = [[1.0] * 4, [y1, y2, y3, y4], [-x1, -x2, -x3, -x4], [rotors.torque_m * sign for sign in YAW_SIGNS]]
-    share = np.linalg.inv(np.array(rows))
-    roll, pitch, yaw = (share[:, 1] * ix).tolist(), (share[:, 2] * iy).tolist(), (share[:, 3] * iz).tolist()
-    collective = mass / 4
+    rows = [[1.0] * 4, ys, [-x for x in xs], [rotors.torque_m * sign for sign in YAW_SIGNS]]
+    _, roll, pitch, yaw = (np.linalg.inv(np.array(rows)) * (1.0, ix, iy, iz)).T.tolist()
+    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # of the rotors
     return Constants(
         thrust=k,
         idle_speed=rotors.idle_speed_rad_s,
@@ -132,14 +127,6 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         rotor_offset=vehicle.rotor_height_m - vehicle.half_height_m,
         rotor_height=vehicle.rotor_height_m,
         ground_effect=vehicle.ground_effect**0.5 * vehicle.rotor_radius_m / 4,
-        x1=x1,
-        x2=x2,
-        x3=x3,
-        x4=x4,
-        y1=y1,
-        y2=y2,
-        y3=y3,
-        y4=y4,
         roll_per_torque=1.0 / ix,
         pitch_per_torque=1.0 / iy,
         yaw_per_thrust=rotors.torque_m / iz,
@@ -153,23 +140,12 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
         rate_gain=2 * vehicle.attitude_damping * vehicle.attitude_frequency_rad_s,
         yaw_gain=1.0 / vehicle.yaw_time_constant_s,
         most_turning=vehicle.most_angular_acceleration_rad_s2,
-        collective=collective,
-        roll1=roll[0],
-        roll2=roll[1],
-        roll3=roll[2],
-        roll4=roll[3],
-        pitch1=pitch[0],
-        pitch2=pitch[1],
-        pitch3=pitch[2],
-        pitch4=pitch[3],
-        yaw1=yaw[0],
-        yaw2=yaw[1],
-        yaw3=yaw[2],
-        yaw4=yaw[3],
+        collective=mass / 4,
         shaft_power=rotors.torque_m * k / rotors.efficiency,
         electronics_power=vehicle.electronics_power_w,
         full_voltage=vehicle.battery_full_v,
         resistance=vehicle.battery_resistance_ohm,
+        **{f"{name}{number}": value for name, values in each.items() for number, value in enumerate(values, 1)},
     )
 
 
@@ -192,8 +168,7 @@ def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
 def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Four, N]:
     """Change the rotors' speeds towards target speeds for a step of :data:`PLANT_STEP_S`.
 
-    Returns:
-        The rotors' speeds, and the reaction on the body as an angular acceleration about z.
+    Return the speeds, and the reaction on the body as an angular acceleration about z.
     """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
@@ -208,24 +183,14 @@ def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Fou
 def advance(
     do: Operations,
     c: Constants,
-    turning: Sequence[N],
-    speeds: Four,
-    twist: N,
-    motion: Sequence[N],
-    knock: Three,
-    legs: bool,
+    turning: Sequence[N],  # quaternion (w, x, y, z; world from body) and body rates
+    speeds: Four,  # rotor speeds, which are constant during the step
+    twist: N,  # reaction of the rotors; see :func:`spin`
+    motion: Sequence[N],  # velocity of the air, position and velocity in world axes
+    knock: Three,  # acceleration in world axes by which contacts changed the body's velocity in the last step
+    legs: bool,  # whether any drone may be standing or lying on something that turns it onto its feet
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        turning: Quaternion (w, x, y, z; world from body) and body rates.
-        speeds: Rotor speeds, which are constant during the step.
-        twist: Reaction of the rotors; see :func:`spin`.
-        motion: Velocity of the air, position and velocity in world axes.
-        knock: Acceleration in world axes by which contacts changed the body's velocity in the last step.
-        legs: Whether any drone may be standing or lying on something that turns it onto its feet.
 
     Returns:
         Quaternion and body rates; position and velocity; the specific force along the body's axes during the step; the
@@ -293,18 +258,10 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the rotor speeds to command in order to turn the body as wanted and lift it.
+    """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
 
-    If the rotors can't do everything, roll and pitch come first, then the thrust; yaw gets a limited share.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        rates: Rates about the body's axes.
-        speeds: Rotor speeds.
-        wanted: The target rates.
-        thrust: Thrust per mass; at 0 the rotors stop.
-        sag: Voltage of the battery as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch come first, then the thrust per mass (at 0 the rotors stop); yaw
+    gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -345,15 +302,7 @@ def electric_power(c: Constants, speeds: Four) -> N:
 
 
 def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tuple[N, N]:
-    """Return a battery's voltage and current.
-
-    Args:
-        do: The operations.
-        c: The constants.
-        power: Power drawn from the battery [W].
-        unloaded: Voltage without a load [V].
-        voltage: Previous voltage [V].
-    """
+    """Return a battery's voltage [V] and current [A] under a power [W], from its unloaded and previous voltage."""
     current = power / do.most(voltage, 1.0)
     # A battery delivers its maximum power at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current

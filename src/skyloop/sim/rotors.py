@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skyloop.errors import UsageError
-from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, columns
-from skyloop.sim.dynamics import STEP_S, BodyTable, body_rates, column
+from skyloop.sim.dynamics import ARRAYS, NUMBERS, STEP_S, BodyTable, Fields, body_rates, column, columns
 from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.rotor_dynamics import (
@@ -29,13 +28,12 @@ from skyloop.sim.rotor_dynamics import (
     spin,
 )
 from skyloop.sim.streams import Floats
+from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
-# Rows of the table of a body's state and inputs, in addition to those of BodyTable.
-_TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
-_TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
-_ROWS = 29
+# First rows, and number, of the table of a body's state and inputs, in addition to those of BodyTable.
+_TURNING, _SPEEDS, _TARGETS, _ROWS = 0, 7, 16, 29
 _AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; cosine near the vertical
 _IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %
 _ROTOR_MARGIN_M_S2 = 60.0  # margin for gravity, ground effect, and drag in a fast dive
@@ -47,13 +45,6 @@ class RotorBodies(BodyTable):
     Their state is a quaternion, body rates and rotor speeds. Angles with their sines, cosines and derivatives are
     computed at the end of each step. An attitude loop (250 Hz), a rate loop and a mixer (1 kHz) follow the inputs
     ``attitude_command`` and ``thrust_command``, except for drones flown by firmware.
-
-    Attributes:
-        quaternion: Rotation from body to world axes, w, x, y, z, (4, n).
-        turning: Body rates, (3, n) [rad/s].
-        speeds: Rotor speeds, (4, n) [rad/s].
-        voltage: Voltage of the batteries under load, (n,) [V].
-        current: Current of the batteries, (n,) [A].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
@@ -61,7 +52,9 @@ class RotorBodies(BodyTable):
         n = len(parameters)
         self.count = 0  #: number of plant steps
         rows = columns(_ROWS, n)
+        #: Rotation from body to world axes, w, x, y, z, (4, n); body rates, (3, n), and rotor speeds, (4, n) [rad/s].
         self.quaternion, self.turning, self.speeds = rows[0:4], rows[4:7], rows[7:11]
+        #: Voltage under load, (n,) [V], and current, (n,) [A], of the batteries.
         self._force, self.voltage, self.current = rows[11:14], rows[14], rows[15]
         self._targets, self._wanted, self._thrust_wanted = rows[16:20], rows[20:23], rows[23]
         self._knock, self._sag, self._open_voltage = rows[24:27], rows[27], rows[28]
@@ -111,11 +104,7 @@ class RotorBodies(BodyTable):
         self.cut(drone)
 
     def command(self, drone: int, commands: Sequence[float]) -> None:
-        """Set the rotor commands of a drone flown by firmware, 0 to 1, in the order of the rotors.
-
-        Raises:
-            UsageError: They are not four finite numbers.
-        """
+        """Set the rotor commands of a drone flown by firmware, 0 to 1, in the order of the rotors."""
         if len(commands) != 4 or not all(map(math.isfinite, commands)):
             raise UsageError(f"firmware must return 4 finite rotor commands, front left first, got {commands!r}")
         constants = self._constants[drone]
@@ -161,7 +150,7 @@ class RotorBodies(BodyTable):
 
     def body_rates_of(self, drone: int) -> tuple[float, float, float]:
         """Return a drone's angular velocity about its body's axes [rad/s]."""
-        return _three(self.turning[:, drone])
+        return vec3(self.turning[:, drone])
 
     @property
     def time_s(self) -> float:
@@ -287,19 +276,14 @@ class _Pilot:
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,
-            _three(bodies.position[:, drone]),
-            _three(velocity[:, drone]),
+            vec3(bodies.position[:, drone]),
+            vec3(velocity[:, drone]),
             (w, x, y, z),
-            _three(bodies.turning[:, drone]),
-            _three(bodies._force[:, drone]),
+            vec3(bodies.turning[:, drone]),
+            vec3(bodies._force[:, drone]),
             float(bodies.voltage[drone]),
             float(bodies.current[drone]),
         )
         commands = self._firmware.exchange(readings)
         if commands is not None:
             bodies.command(drone, commands)
-
-
-def _three(values: Floats) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z

@@ -18,17 +18,16 @@ from skyloop.messages import Action, AnyAction, FlightState
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.sim.autopilot import Autopilot, Batteries
 from skyloop.sim.collisions import Collisions
-from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.control_loops import ControlLoops, Sensors
 from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable, WindField
 from skyloop.sim.instruments import Firmware, Instruments
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
 from skyloop.sim.rotors import RotorBodies
-from skyloop.sim.sensors import Sensors
 from skyloop.sim.solids import Solids, place
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
-from skyloop.sim.world import TargetState, Vec3, Wind, World
+from skyloop.sim.world import TargetState, Vec3, Wind, World, vec3
 
 LOOP_STEPS = 4  # steps per update of the autopilot's outer loops, altimeter and velocity (62.5 Hz)
 SLOW_STEPS = 25  # steps per update of the batteries and of the wandering biases (10 Hz)
@@ -40,13 +39,7 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query.
-
-    Attributes:
-        world: The world.
-        parameters: The parameters of each drone.
-        seed: Seed for all noise and gusts.
-    """
+    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query."""
 
     def __init__(
         self,
@@ -80,8 +73,8 @@ class Simulation:
         if not 0 < charge <= 1:
             raise UsageError(f"charge must be greater than 0 and at most 1, not {charge!r}")
         self.world = world
-        self.parameters = _one_each(parameters, drones, "parameters")
-        self.seed = world.seed if seed is None else seed
+        self.parameters = _one_each(parameters, drones, "parameters")  #: the parameters of each drone
+        self.seed = world.seed if seed is None else seed  #: seed for all noise and gusts
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
         self._lock = threading.RLock()
@@ -110,11 +103,6 @@ class Simulation:
     def drones(self) -> int:
         """Number of drones, which are numbered from 0."""
         return len(self.parameters)
-
-    @property
-    def step_count(self) -> int:
-        """Number of finished steps."""
-        return self._step
 
     @property
     def time_s(self) -> float:
@@ -220,9 +208,6 @@ class Simulation:
         """Take a drone back from its firmware. Its rotors stop and the built-in autopilot takes over.
 
         A drone in the air falls in an emergency.
-
-        Raises:
-            UsageError: There is no such drone, or no firmware flies it.
         """
         with self._lock:
             if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
@@ -246,11 +231,7 @@ class Simulation:
             self._wind = WindField(wind, self.seed, self.drones, LOOP_STEPS * STEP_S)
 
     def set_charge(self, drone: int, charge: float) -> None:
-        """Set a drone's battery charge.
-
-        Raises:
-            UsageError: There is no such drone, or the charge is not between 0 and 1.
-        """
+        """Set a drone's battery charge."""
         if not 0 <= charge <= 1:
             raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
         with self._lock:
@@ -259,14 +240,7 @@ class Simulation:
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
         """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
-        Args:
-            drone: The drone's number.
-            position_m: New position of its centre in world axes.
-            yaw_rad: New heading of the drone.
-            charge: Charge of its battery, 0 to 1.
-
-        Raises:
-            UsageError: The drone is not flying, or a number is out of its range.
+        The position is that of its centre in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -303,7 +277,7 @@ class Simulation:
                 pitch_rad=inertial[7],
                 yaw_rad=wrap_angle(inertial[8]),
                 altitude_m=float(sensors.altitude[i]),
-                velocity_m_s=_vec3(sensors.velocity[:, i]),
+                velocity_m_s=vec3(sensors.velocity[:, i]),
                 angular_velocity_rad_s=(inertial[0], inertial[1], inertial[2]),
                 acceleration_m_s2=(inertial[3], inertial[4], inertial[5]),
             )
@@ -316,23 +290,22 @@ class Simulation:
             return VehicleTruth(
                 time_s=self.time_s,
                 state=self._autopilot.states[i],
-                position_m=_vec3(bodies.position[:, i]),
-                velocity_m_s=_vec3(bodies.velocity[:, i]),
+                position_m=vec3(bodies.position[:, i]),
+                velocity_m_s=vec3(bodies.velocity[:, i]),
                 roll_rad=roll,
                 pitch_rad=pitch,
                 yaw_rad=wrap_angle(yaw),
                 quaternion=quaternion_from_euler(roll, pitch, yaw),
                 angular_velocity_rad_s=bodies.body_rates_of(i),
                 thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
-                wind_m_s=_vec3(bodies.air[:, i]),
+                wind_m_s=vec3(bodies.air[:, i]),
                 battery=float(self._batteries.charge[i]),
             )
 
     def poses(self) -> tuple[Floats, Floats]:
         """Return the true poses of all bodies as new arrays, for a renderer or for motion capture.
 
-        Returns:
-            Positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
+        They are positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
         """
         with self._lock:
             return self._bodies.position.T.copy(), self._bodies.rotations()
@@ -340,9 +313,8 @@ class Simulation:
     def motions(self) -> tuple[Floats, Floats, Floats]:
         """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
-        Returns:
-            True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up
-            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
+        They are true positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up,
+        up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()
@@ -355,20 +327,12 @@ class Simulation:
             return np.array([state.airborne for state in self._autopilot.states])
 
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
-        """Return the states of the moving targets in the world's order.
-
-        Args:
-            time_s: Simulation time; None for now.
-        """
+        """Return the states of the moving targets in the world's order, now or at a simulation time."""
         time = self.time_s if time_s is None else time_s
         return tuple(track.at(time) for track in self._tracks)
 
     def light(self, time_s: float | None = None) -> float:
-        """Return the brightness of the world's light, at most 1; see :class:`~skyloop.sim.world.Light`.
-
-        Args:
-            time_s: Simulation time; None for now.
-        """
+        """Return the brightness of the world's :class:`~skyloop.sim.world.Light`, at most 1, now or at a time."""
         return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
 
     def take_occurrences(self) -> list[Occurrence]:
@@ -398,8 +362,3 @@ def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
     if len(have) > 1:
         raise UsageError("vehicles with and without rotors (VehicleParameters.rotors) need separate simulations")
     return have.pop()
-
-
-def _vec3(values: Floats) -> Vec3:
-    x, y, z = values.tolist()
-    return (x, y, z)

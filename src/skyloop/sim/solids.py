@@ -17,19 +17,12 @@ from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Spawn, Vec
 
 
 class Overlap(NamedTuple):
-    """A drone's overlap with a solid or with the room's walls and ceiling.
+    """A drone's overlap with a solid or with the room's walls and ceiling."""
 
-    Attributes:
-        normal: Direction out of the solid.
-        depth_m: Depth along that direction.
-        surface_m_s: Velocity of the solid's surface at the drone's centre.
-        spin_rad_s: Turn rate of the surface, counter-clockwise from above.
-    """
-
-    normal: Vec3
-    depth_m: float
-    surface_m_s: Vec3 = (0.0, 0.0, 0.0)
-    spin_rad_s: float = 0.0
+    normal: Vec3  #: direction out of the solid
+    depth_m: float  #: depth along that direction
+    surface_m_s: Vec3 = (0.0, 0.0, 0.0)  #: velocity of the solid's surface at the drone's centre
+    spin_rad_s: float = 0.0  #: turn rate of the surface, counter-clockwise from above
 
 
 class Solids:
@@ -38,8 +31,9 @@ class Solids:
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
         movers = [(track, track.target) for track in tracks if isinstance(track.target, PlatformTarget | FigureTarget)]
-        self._fixed = len(boxes)
+        self.fixed = len(boxes)  #: number of fixed solids
         self._movers = [track for track, _ in movers]
+        self.moving = bool(movers)  #: whether any of the solids is moving
         self._lifts = [isinstance(target, PlatformTarget) for _, target in movers]
         sizes = [box.size_m for box in boxes] + [target.size_m for _, target in movers]
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
@@ -61,23 +55,13 @@ class Solids:
         self.top_speed_m_s = max((_top_speed(target) for _, target in movers), default=0.0)
         self.move(0.0)
 
-    @property
-    def moving(self) -> bool:
-        """Whether any of the solids is moving."""
-        return bool(self._movers)
-
     def __len__(self) -> int:
         """Return the number of boxes, platforms and figures. They are numbered, with moving ones last."""
         return len(self._boxes)
 
-    @property
-    def fixed(self) -> int:
-        """Number of fixed solids."""
-        return self._fixed
-
     def move(self, time_s: float) -> None:
         """Move the moving solids to their positions at a point in time."""
-        for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
+        for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self.fixed):
             state = track.at(time_s)
             x, y, z = state.position_m  # a platform's top, a figure's footprint
             half = float(self._half[2, number, 0])
@@ -87,16 +71,15 @@ class Solids:
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
         """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
 
-        Args:
-            seconds: Time for which moving solids stay within their boxes, from their current positions.
-            radius_m: Radius of hulls, which touch a box only if their own bounding box overlaps this one. (The distance
-                between a hull and a turned box's corner is that of a square turned the same way.)
+        Moving solids stay within theirs for so many seconds, and a hull of that radius touches a box only if their
+        bounding boxes overlap. (The distance between a hull and a turned box's corner is that of a square turned the
+        same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
-            self._bound(slice(0, self._fixed), 0.0)
+            self._bound(slice(0, self.fixed), 0.0)
         if self._movers:
-            self._bound(slice(self._fixed, None), self.top_speed_m_s * seconds)
+            self._bound(slice(self.fixed, None), self.top_speed_m_s * seconds)
         return self._bounds
 
     def _bound(self, which: slice, reach_m: float) -> None:
@@ -110,12 +93,10 @@ class Solids:
         high[:, which] = (self._centre[:, which] + around)[:, :, 0]
 
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
-        """Return which points are inside their solids, as indices into ``points`` in ascending order.
+        """Return which of the points (3, m), m > 0, are inside their solids, as indices in ascending order.
 
-        Args:
-            points: The points, shape (3, m), with m at least 1.
-            numbers: Number of the solid for each point, shape (m,).
-            sizes: Sizes from :meth:`sizes` for the same numbers and the points' hulls.
+        Each point has the number of its solid, (m,), and its sizes, from :meth:`sizes` for the same numbers and its
+        hull.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -129,13 +110,10 @@ class Solids:
         return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
-        """Return the distance to the nearest solid, wall or ceiling, (m,).
+        """Return the distance of drones at points (3, m) to the nearest solid, wall or ceiling, (m,).
 
-        It is never more than the true distance, and negative inside a solid.
-
-        Args:
-            points: Positions of the drones, (3, m).
-            hulls: Radius, radius, half height, (3, m).
+        It is never more than the true distance, and negative inside a solid. ``hulls`` are radius, radius, half height,
+        (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
         nearest: Floats = room.min(axis=0)
@@ -147,14 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return the deepest overlap of a drone; None if there is none.
-
-        Args:
-            point: The drone's centre, three numbers [m].
-            radius: Radius of the hull [m].
-            half_height: Half height of the hull [m].
-            among: Solids to check in addition to the room; None for all.
-        """
+        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all); None without one."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None
@@ -185,12 +156,9 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance to the first solid, including the floor [m]; infinite if there is none.
+        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite without one.
 
-        Args:
-            point: Start of a beam, whose length is 0 if it starts below the floor.
-            direction: Direction of the beam, a unit vector.
-            time_s: Simulation time, which determines the positions of moving solids.
+        It is 0 from a point below the floor.
         """
         if self._movers:
             self.move(time_s)
@@ -220,7 +188,7 @@ class Solids:
 
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
-        if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
+        if number >= self.fixed and self._lifts[number - self.fixed] and local[2] > 0:
             axis = 2  # a platform lifts everything on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
@@ -264,13 +232,8 @@ Indices = NDArray[np.intp]
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
     """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
 
-    Args:
-        low: Minimum coordinates of the boxes, shape (3, n) [m].
-        high: Maximum coordinates, shape (3, n).
-        movable: Number of first boxes, at least one of which must be in each pair.
-
-    Returns:
-        The lower and the higher number in each pair, in ascending order. Boxes that touch count as overlapping.
+    Boxes go from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one of a pair is among the
+    first ``movable`` ones. The pairs' lower and higher numbers are in ascending order.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -298,11 +261,7 @@ _MARGINS_M = (0.6, 0.3, 0.15)  # distances between hulls and to obstacles; the f
 
 
 def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
-    """Return a free starting position for each drone: first the world's own, then a grid around the first of them.
-
-    Raises:
-        UsageError: There are not enough positions, or one of the world's own is inside a solid.
-    """
+    """Return a free starting position for each drone: first the world's own, then a grid around the first of them."""
     spawns = list(world.spawns[: len(parameters)])
     for spawn, drone in zip(spawns, parameters, strict=False):
         if not _is_clear(spawn, drone, solids, 0.0):

@@ -10,7 +10,6 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,6 +32,7 @@ from skyloop.sim.world import (
     WalkPath,
     WaypointPath,
     Yaw,
+    vec3,
 )
 
 GRID_S = 0.02  # spacing of the points, between which motion is linear
@@ -42,12 +42,7 @@ _TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
 _RING_STEP_RAD = (math.radians(20), math.radians(45))
 
 
-@dataclass(frozen=True, slots=True)
-class _Point:
-    position: Vec3
-    velocity: Vec3
-    yaw: float  # not wrapped
-    walked: float
+_Point = tuple[Vec3, float, float]  # position, yaw (not wrapped), distance walked
 
 
 class TargetTrack:
@@ -62,23 +57,19 @@ class TargetTrack:
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> TargetState:
-        """Return the state at a simulation time [s].
-
-        Raises:
-            UsageError: The time is before the start or more than :data:`KEPT_S` before the latest requested time.
-        """
+        """Return the state at a simulation time [s]."""
         if not (math.isfinite(time_s) and time_s >= 0):
             raise UsageError(f"time must be a finite number of at least 0 s, not {time_s!r}")
         index, part = divmod(time_s / GRID_S, 1.0)
         with self._lock:
-            first, second = self._pair(int(index))
-        position = tuple(a + part * (b - a) for a, b in zip(first.position, second.position, strict=True))
-        yaw = wrap_angle(first.yaw + part * (second.yaw - first.yaw))
-        walked = first.walked + part * (second.walked - first.walked)
+            (here, heading, walked), (there, next_heading, next_walked) = self._pair(int(index))
+        position = tuple(a + part * (b - a) for a, b in zip(here, there, strict=True))
+        yaw = wrap_angle(heading + part * (next_heading - heading))
+        walked += part * (next_walked - walked)
         place = (position[0], position[1], position[2])
         # Use the velocity between the points, not at the first one; otherwise a drone on a platform would creep.
-        velocity = _vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
-        rate = (second.yaw - first.yaw) / GRID_S
+        velocity = vec3((np.array(there) - np.array(here)) / GRID_S)
+        rate = (next_heading - heading) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
 
     def _pair(self, index: int) -> tuple[_Point, _Point]:
@@ -131,7 +122,7 @@ def _waypoints(path: WaypointPath) -> Iterator[tuple[Vec3, Vec3]]:
         distance = step * GRID_S * path.speed_m_s % ends[-1]
         leg = next((n for n, end in enumerate(ends) if distance < end), len(ends) - 1)
         along = 1.0 - (ends[leg] - distance) / lengths[leg]
-        yield _vec3(starts[leg] + along * legs[leg]), _vec3(legs[leg] * (path.speed_m_s / lengths[leg]))
+        yield vec3(starts[leg] + along * legs[leg]), vec3(legs[leg] * (path.speed_m_s / lengths[leg]))
 
 
 def _circle(path: CirclePath, time_s: float) -> tuple[Vec3, Vec3]:
@@ -164,12 +155,12 @@ def _lissajous(path: LissajousPath, time_s: float) -> tuple[Vec3, Vec3]:
     rates = 2 * math.pi * np.array(path.cycles) / path.period_s
     angles = rates * time_s + np.array(path.phase_rad)
     amplitude = np.array(path.amplitude_m)
-    return _vec3(np.array(path.centre_m) + amplitude * np.sin(angles)), _vec3(amplitude * rates * np.cos(angles))
+    return vec3(np.array(path.centre_m) + amplitude * np.sin(angles)), vec3(amplitude * rates * np.cos(angles))
 
 
 def _walk_goals(path: WalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
     while True:
-        yield _vec3(rng.uniform(path.low_m, path.high_m))
+        yield vec3(rng.uniform(path.low_m, path.high_m))
 
 
 def _ring_goals(path: RingWalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
@@ -195,7 +186,7 @@ def _steer(
     velocity = np.zeros(3)
     speed = float(rng.uniform(*speeds))
     while True:
-        yield _vec3(position), _vec3(velocity)
+        yield vec3(position), vec3(velocity)
         way = goal - position
         distance = float(np.linalg.norm(way))
         while distance < speed * speed / (2 * acceleration) + 0.02:
@@ -220,7 +211,7 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
             heading += clamped(wrap_angle(wanted - heading), most)
         walked += 0.0 if last is None else math.dist(position, last)
         last = position
-        yield _Point(position, velocity, heading, walked)
+        yield position, heading, walked
 
 
 def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:
@@ -234,7 +225,3 @@ def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:
     if math.hypot(velocity[0], velocity[1]) < 0.02:
         return None
     return math.atan2(velocity[1], velocity[0]) + yaw.offset_rad
-
-
-def _vec3(values: np.typing.NDArray[np.float64]) -> Vec3:
-    return (float(values[0]), float(values[1]), float(values[2]))

@@ -12,11 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.messages.parameter import Card, Opening, Solid, Start, WorldGeometry
 from skyloop.sim.streams import Purpose, stream
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Rgb = tuple[int, int, int]
+
+
+def vec3(values: NDArray[np.float64]) -> Vec3:
+    """Return three numbers of an array as plain floats."""
+    x, y, z = values.tolist()
+    return x, y, z
+
 
 # Surface names that a renderer must support. A world file with any other name is refused.
 TEXTURES: tuple[str, ...] = (
@@ -115,21 +123,13 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A rectangular frame to fly through.
-
-    Attributes:
-        name: The gate's name.
-        position_m: Position of the opening's centre.
-        inner_size_m: Width and height of the opening.
-        yaw_rad: Heading for flying through the gate.
-        frame_m: Thickness of the bars.
-    """
+    """A rectangular frame to fly through."""
 
     name: str
-    position_m: Vec3
-    inner_size_m: Vec2
-    yaw_rad: float = 0.0
-    frame_m: float = 0.08
+    position_m: Vec3  #: position of the opening's centre
+    inner_size_m: Vec2  #: width and height of the opening
+    yaw_rad: float = 0.0  #: heading for flying through the gate
+    frame_m: float = 0.08  #: thickness of the bars
     colour: Rgb = (235, 110, 20)
 
     def bars(self) -> tuple[Box, ...]:
@@ -336,24 +336,16 @@ class FigureTarget:
     """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
     The path is that of the middle of its footprint (z is the ground below), and the yaw is its heading.
-
-    Attributes:
-        name: The target's name.
-        shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
-        path: Its path.
-        yaw: Its heading.
-        size_m: Size along the figure's own x (ahead), y (left) and z.
-        look: Number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes.
-        colour: Colour of a person's top or a car's body; None for the look's colour.
     """
 
     name: str
-    shape: str
+    shape: str  #: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`
     path: Path
     yaw: Yaw
-    size_m: Vec3
+    size_m: Vec3  #: size along the figure's own x (ahead), y (left) and z
+    #: number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes
     look: int = 0
-    colour: Rgb | None = None
+    colour: Rgb | None = None  #: colour of a person's top or a car's body; None for the look's colour
 
 
 Target = BoardTarget | PlatformTarget | FigureTarget
@@ -445,3 +437,36 @@ class World:
     def solids(self) -> tuple[Box, ...]:
         """Return every fixed solid: the boxes, and the gates' bars and legs."""
         return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())
+
+
+def geometry_of(world: World) -> WorldGeometry:
+    """Return the fixed geometry of a world, without textures and moving objects."""
+    x, y, z = world.room.size_m
+    return WorldGeometry(
+        name=world.name[:64],
+        low=(-x / 2, -y / 2, 0.0),
+        high=(x / 2, y / 2, z),
+        enclosed=world.room.enclosed,
+        solids=tuple(
+            Solid(b.name, _rounded(b.position_m), _rounded(b.size_m), round(b.yaw_rad, 4)) for b in world.boxes
+        ),
+        gates=tuple(
+            Opening(g.name, _rounded(g.position_m), g.inner_size_m, round(g.yaw_rad, 4), g.frame_m) for g in world.gates
+        ),
+        markers=tuple(
+            Card(
+                m.name,
+                _rounded(m.pose.position_m),
+                m.pattern.size_m,
+                round(m.pose.yaw_rad, 4),
+                round(m.pose.elevation_rad, 4),
+            )
+            for m in world.markers
+        ),
+        starts=tuple(Start(s.name, _rounded(s.position_m), round(s.yaw_rad, 4)) for s in world.spawns),
+    )
+
+
+def _rounded(place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Round to millimetres, to keep the text short."""
+    return round(place[0], 3), round(place[1], 3), round(place[2], 3)

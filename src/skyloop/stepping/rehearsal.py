@@ -33,8 +33,7 @@ from skyloop.sim.camera import CameraModel
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import TICK_S, Report, ReportPublisher, SimHost, Stepper
 from skyloop.sim.options import SimOptions
-from skyloop.stepping.scheduler import StepScheduler
-from skyloop.stepping.transport import StepExecutor, SteppedServer
+from skyloop.stepping.transport import StepExecutor, SteppedServer, StepScheduler
 from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.options import options_of
 
@@ -190,13 +189,7 @@ class SteppedHost(SimHost):
     """
 
     def __init__(self, options: SimOptions, clock: Clock, drones: int = 1) -> None:
-        """Initialise the world.
-
-        Args:
-            options: Options of the simulation.
-            clock: The clock that stamps the observers' samples; the caller moves it to :attr:`due_ns` before each step.
-            drones: Number of drones in the world.
-        """
+        """Initialise the world; the caller moves the clock to :attr:`due_ns` before each step."""
         super().__init__(options, drones)
         self._clock = clock
         self._manual_stepper: _ManualStepper | None = None

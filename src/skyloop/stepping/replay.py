@@ -14,8 +14,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.uri import parse_uri
 from skyloop.proxy.proxy import Proxy
-from skyloop.stepping.scheduler import StepScheduler
-from skyloop.stepping.transport import StepExecutor, SteppedServer
+from skyloop.stepping.transport import StepExecutor, SteppedServer, StepScheduler
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
@@ -42,11 +41,7 @@ class SteppedReplay:
     """The proxy of a replay, and the simulated time that it shares with its only application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
-        """Start the proxy.
-
-        Args:
-            driver: The replay's driver.
-        """
+        """Start the proxy."""
         self.reach = None
         self._executor = StepExecutor("skyloop-stepping")
         try:

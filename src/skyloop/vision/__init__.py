@@ -5,16 +5,14 @@ Needs the extra ``vision``, and ``detect`` for detectors. OpenCV and ONNX Runtim
 
 from skyloop.vision.appearance import LongTermTracker
 from skyloop.vision.calibrating import Board, BoardFinder, BoardView, Collector, calibrate
-from skyloop.vision.detector_layouts import Layout
 from skyloop.vision.flow import GroundTracker
 from skyloop.vision.gates import BlobDetector, BlobSighting, GateDetector, GateSighting, PoleDetector, PoleSighting
 from skyloop.vision.lens import project, undistort, unproject
 from skyloop.vision.object_tracks import Detection, ObjectDetector, ObjectTracks, TrackedObject
-from skyloop.vision.onnx_detector import OnnxDetector
+from skyloop.vision.onnx_detector import Layout, OnnxDetector
 from skyloop.vision.planar import MarkerDetector, MarkerSighting, PlanarSighting
 from skyloop.vision.simulated import simulated_detector
-from skyloop.vision.trackers import CorrelationTracker, LearnedTracker, MedianFlowTracker
-from skyloop.vision.tracking import Tracker, TrackResult
+from skyloop.vision.tracking import CorrelationTracker, LearnedTracker, MedianFlowTracker, Tracker, TrackResult
 
 __all__ = [
     "BlobDetector",

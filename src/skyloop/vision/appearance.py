@@ -16,12 +16,12 @@ import numpy as np
 
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import within
+from skyloop.vision.lens import pixels_of
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import pixels_of
-from skyloop.vision.trackers import CorrelationTracker
 from skyloop.vision.tracking import (
     LEAST_PX,
     Box,
+    CorrelationTracker,
     Floats,
     Image,
     Tracker,
@@ -235,14 +235,7 @@ def colours(image: Image, box: Box) -> Floats:
     """Return the colours of a box's upper and lower half, (5, 6) float32: L, a, b of each (CIELAB).
 
     One row for each of five strips, each a third of the box's width, from left to right: a person with an arm or a leg
-    stretched out is not in the middle of the box, which then shows the background.
-
-    Args:
-        image: uint8, (h, w, 3) BGR or (h, w) grey.
-        box: x, y, width, height [px].
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
+    stretched out is not in the middle of the box, which then shows the background. The image is BGR or grey.
     """
     cv = opencv("comparing colours")
     x, y, width, height = box
@@ -300,15 +293,10 @@ class TargetMemory:
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Search the whole image for the target, using another of its appearances each time.
+        """Search the whole image for the target [px], using another of its appearances each time.
 
-        Args:
-            image: The image.
-            size: Width and height of the target [px].
-            besides: Skip places that overlap this box by more than a tenth.
-
-        Returns:
-            At most the three best places, the most similar first.
+        Return at most the three best places, the most similar first, without those that overlap ``besides`` by over a
+        tenth.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
         rows, columns = image.shape[:2]

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from skyloop.calibration import Calibration
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.files import replacing
+from skyloop.vision.lens import Array
 from skyloop.vision.opencv import marker_dictionary, opencv
 
-Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
 _MARKER_SHARE = 0.74  # marker's side as a fraction of the square's side
@@ -247,13 +247,7 @@ class Collector:
 
 
 def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Return the fraction of a grid's cells over the image that contain a corner, 0 to 1.
-
-    Args:
-        views: Views of one camera.
-        width: Width of the images [px].
-        height: Height of the images [px].
-    """
+    """Return the fraction of a grid's cells over one camera's images [px] that contain a corner, 0 to 1."""
     cells = np.zeros(GRID, dtype=bool)
     for view in views:
         column = np.clip((view.pixels[:, 0] / width * GRID[0]).astype(int), 0, GRID[0] - 1)

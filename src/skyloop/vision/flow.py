@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 
 from skyloop.messages import CameraInfo, Feedback, Intrinsics
 from skyloop.poses import mounting_rotation
-from skyloop.vision.lens import normalised
+from skyloop.vision.lens import Array, checked, normalised
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import checked
-
-Array = NDArray[np.float64]
 
 _MOST: Final = 80  # maximum number of tracked corners
 _ENOUGH: Final = 8  # minimum number of corners for a position
@@ -32,11 +29,7 @@ _LOWEST_M: Final = 0.15  # minimum height; any closer to the ground, the image h
 
 
 class GroundTracker:
-    """Tracks the ground in a downward camera's frames and computes the vehicle's position relative to its start.
-
-    Attributes:
-        place: Position at the last frame, (2,) [m]: along yaw 0, and to the left of that direction.
-    """
+    """Tracks the ground in a downward camera's frames and computes the vehicle's position relative to its start."""
 
     def __init__(self, camera: CameraInfo) -> None:
         """Initialise the tracker.

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.vision.lens import normalised, project
+from skyloop.vision.lens import Array, checked, normalised, project
 from skyloop.vision.opencv import opencv
-from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, rectangle
+from skyloop.vision.planar import PlanarPose, PlanarSighting, rectangle
 
 Rgb = tuple[int, int, int]
 
@@ -43,15 +43,7 @@ class ColourMask:
     """Selects pixels by hue at any brightness, if their saturation is high enough."""
 
     def __init__(self, colour: Rgb) -> None:
-        """Prepare the mask.
-
-        Args:
-            colour: Red, green, blue, 0 to 255.
-
-        Raises:
-            UsageError: The colour is invalid, or too grey to have a hue.
-            MissingExtraError: OpenCV is not installed.
-        """
+        """Prepare the mask; UsageError for a colour that is invalid or too grey to have a hue."""
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
             raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
         self._cv = opencv("finding a colour")
@@ -271,17 +263,11 @@ def _along(edge: Array, begin: Array, end: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoleSighting:
-    """One pole in one image.
+    """One pole in one image."""
 
-    Attributes:
-        top: The middle of the pole's upper end, (2,) pixels.
-        ray: Ray through the top, in optical axes, (3,), z = 1.
-        width_px: Width at half the pole's height.
-    """
-
-    top: Array
-    ray: Array
-    width_px: float
+    top: Array  #: the middle of the pole's upper end, (2,) pixels
+    ray: Array  #: ray through the top, in optical axes, (3,), z = 1
+    width_px: float  #: width at half the pole's height
 
     def ray_in_body(self, camera: CameraInfo) -> Array:
         """Return the ray in body axes, (3,)."""

@@ -25,6 +25,33 @@ _RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it
 _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversion
 
 
+def checked(
+    image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
+) -> tuple[NDArray[np.uint8], Intrinsics]:
+    """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
+
+    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
+    wrong shape or type, an empty array, or without intrinsics.
+    """
+    if intrinsics is None:
+        intrinsics = getattr(image, "intrinsics", None)
+    if intrinsics is None:
+        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
+    return pixels_of(image, colour=colour), intrinsics
+
+
+def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
+    """Check an image as :func:`checked` does and return its pixels as a plain array that shares its memory."""
+    pixels = np.asarray(image)
+    grey = pixels.ndim == 2 and not colour
+    if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):
+        wanted = "(h, w, 3)" if colour else "(h, w, 3) or (h, w)"
+        raise UsageError(f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
+    if pixels.size == 0:
+        raise UsageError("the image is empty")
+    return pixels
+
+
 def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
     """Project points into the image.
 
@@ -75,18 +102,7 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z (n, 2) of the viewing directions of pixels.
-
-    Args:
-        pixels: Shape (n, 2).
-        intrinsics: Intrinsics of the camera.
-
-    Returns:
-        The values; NaN also for directions beside or behind the camera.
-
-    Raises:
-        UsageError: The shape is wrong, or the model is unknown.
-    """
+    """Return x/z and y/z (n, 2) of the directions of pixels (n, 2); NaN also for those beside or behind the camera."""
     if not _is_fisheye(intrinsics):
         return _ideal(_rows(pixels, 2), intrinsics)
     rays = unproject(pixels, intrinsics)
@@ -112,15 +128,7 @@ def undistort(
         UsageError: An argument is out of its range, or there are no intrinsics.
         MissingExtraError: OpenCV is not installed.
     """
-    if intrinsics is None:
-        intrinsics = getattr(image, "intrinsics", None)
-    if intrinsics is None:
-        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
-    pixels = np.asarray(image)
-    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
-        raise UsageError(
-            f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, (h, w, 3) or (h, w)"
-        )
+    pixels, intrinsics = checked(image, intrinsics)
     if not 0.0 <= balance <= 1.0:
         raise UsageError(f"balance is {balance!r} and must be from 0 to 1")
     ideal, across, down = _maps(intrinsics, pixels.shape[1], pixels.shape[0], balance)

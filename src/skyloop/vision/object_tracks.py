@@ -63,12 +63,7 @@ class ObjectDetector(Protocol):
 
 
 def overlaps(one: Floats, others: Floats) -> Floats:
-    """Return the overlap of each box with one box: intersection over union, 0 to 1.
-
-    Args:
-        one: (4,) left, top, right, bottom.
-        others: (n, 4), in the same order.
-    """
+    """Return the overlap of each box with one box (left, top, right, bottom): intersection over union, 0 to 1."""
     low = np.maximum(one[:2], others[:, :2])
     high = np.minimum(one[2:], others[:, 2:])
     shared = np.prod(np.clip(high - low, 0.0, None), axis=1)
@@ -78,16 +73,10 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 
 
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
-    """Keep the best of several overlapping boxes, class by class (non-maximum suppression).
+    """Keep the best of several overlapping boxes (left, top, right, bottom), class by class: non-maximum suppression.
 
-    Args:
-        corners: (n, 4) left, top, right, bottom.
-        scores: (n,).
-        classes: (n,) class numbers.
-        iou: Boxes of a class that overlap more count as the same object.
-
-    Returns:
-        The numbers of the rows kept, the best first.
+    Return the numbers of the rows kept, the best first. Boxes of a class that overlap by more than ``iou`` count as
+    one.
     """
     left = np.argsort(-scores, kind="stable")
     kept: list[int] = []

@@ -28,17 +28,8 @@ _CHILD: Final = (
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
     """Load a network after a child process has loaded and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
-    Args:
-        path: The ONNX file.
-        threads: CPU threads for one run.
-        purpose: The feature that needs it; a noun phrase for the error message.
-
-    Returns:
-        The exceptions that running the network can raise, and ONNX Runtime's session.
-
-    Raises:
-        MissingExtraError: ONNX Runtime is not installed.
-        FileFormatError: The file is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
+    Return the exceptions that running it can raise, and ONNX Runtime's session. ``purpose`` is a noun phrase for the
+    error message. FileFormatError if ONNX Runtime can't load the file within the limits.
     """
     try:
         import onnxruntime
@@ -63,14 +54,9 @@ def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
 
 
 def try_alone(*files: Path | str, tracker: str = "") -> None:
-    """Load and run a network in a child process within limits.
+    """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    Args:
-        files: The network's file; one or two for a tracker.
-        tracker: Name of the OpenCV tracker that the weights are for; empty to load the file in ONNX Runtime.
-
-    Raises:
-        FileFormatError: The network can't be loaded within the limits.
+    One or two files make a tracker of OpenCV, by its name; without a name the file is loaded in ONNX Runtime.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]

@@ -8,17 +8,7 @@ from skyloop.errors import MissingExtraError, UnknownNameError
 
 
 def opencv(what: str) -> Any:
-    """Import OpenCV.
-
-    Args:
-        what: The feature that needs it; a noun phrase for the error message.
-
-    Returns:
-        The module ``cv2``.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    """Import OpenCV, which is needed for ``what``: a noun phrase for the error message."""
     try:
         import cv2
     except ImportError as error:
@@ -27,15 +17,7 @@ def opencv(what: str) -> Any:
 
 
 def marker_dictionary(cv: Any, dictionary: str) -> Any:
-    """Return one of OpenCV's predefined dictionaries.
-
-    Args:
-        cv: The module ``cv2``.
-        dictionary: Name with or without ``DICT_``, in upper or lower case.
-
-    Raises:
-        UnknownNameError: OpenCV has no such dictionary.
-    """
+    """Return one of OpenCV's predefined dictionaries by its name, with or without ``DICT_``, in upper or lower case."""
     known = {name[5:].lower(): name for name in dir(cv.aruco) if name.startswith("DICT_")}
     name = known.get(dictionary.lower().removeprefix("dict_"))
     if name is None:

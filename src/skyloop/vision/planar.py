@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.poses import mounting_rotation, transform
-from skyloop.vision.lens import normalised
+from skyloop.vision.lens import Array, checked, normalised
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -91,16 +88,10 @@ class PlanarPose:
 
     @classmethod
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
-        """Estimate the pose from the four corners.
+        """Estimate the pose from the four corners; None if no pose in front of the camera fits them.
 
-        Args:
-            cv: The module ``cv2``.
-            outline_m: The corners in the object's own axes, (4, 3).
-            rays: x/z and y/z of each corner in the image, (4, 2).
-            method: One of OpenCV's IPPE methods.
-
-        Returns:
-            The best pose; None if no pose in front of the camera fits the corners.
+        The outline is in the object's own axes, (4, 3); rays are x/z and y/z of each corner; the method is an IPPE of
+        OpenCV.
         """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
@@ -118,46 +109,6 @@ def rectangle(width_m: float, height_m: float) -> Array:
     """Return a rectangle's corners in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
     x, y = width_m / 2, height_m / 2
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
-
-
-def checked(
-    image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
-) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image and return its pixels as a plain array, together with its intrinsics.
-
-    Args:
-        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        intrinsics: Intrinsics of the camera; None uses the frame's own.
-        colour: Whether to refuse grey images.
-
-    Raises:
-        UsageError: The array has a wrong shape or type or is empty, or there are no intrinsics.
-    """
-    if intrinsics is None:
-        intrinsics = getattr(image, "intrinsics", None)
-    if intrinsics is None:
-        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
-    return pixels_of(image, colour=colour), intrinsics
-
-
-def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
-    """Check an image and return its pixels as a plain array that shares its memory.
-
-    Args:
-        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        colour: Whether to refuse grey images.
-
-    Raises:
-        UsageError: The array has a wrong shape or type, or is empty.
-    """
-    pixels = np.asarray(image)
-    grey = pixels.ndim == 2 and not colour
-    if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):
-        wanted = "(h, w, 3)" if colour else "(h, w, 3) or (h, w)"
-        raise UsageError(f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
-    if pixels.size == 0:
-        raise UsageError("the image is empty")
-    return pixels
 
 
 #: The largest dictionary of each family, which contains the smaller ones' markers with the same ids.

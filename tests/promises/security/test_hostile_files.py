@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.recorded_steps import read_recording
 from skyloop.calibration import load_calibration
 from skyloop.cockpit.access import read_tokens
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.network.keys import Lab
-from skyloop.sim.identification import read_recording
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.mavlink.options import options_of
 

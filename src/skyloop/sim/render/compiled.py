@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 
 from skyloop.sim.camera import BOTTOM_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import kernels, shading
-from skyloop.sim.render.base import Image
 from skyloop.sim.render.painter import Painter, Raster
-from skyloop.sim.render.quads import GAP, Atlas, AtlasBuilder, Floats, QuadBuilder, Quads
-from skyloop.sim.render.shading import Placed
-from skyloop.sim.render.visibility import EDGE_ON_M, PRIORITY_SHARE
+from skyloop.sim.render.quads import GAP, Atlas, AtlasBuilder, Floats, Image, QuadBuilder, Quads
+from skyloop.sim.render.shading import EDGE_ON_M, PRIORITY_SHARE, Placed
 
 _log = logging.getLogger(__name__)
 _CONSTANTS: Final = np.array(
@@ -44,14 +42,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels. See :class:`Painter`.
-
-    Args:
-        raster: See :class:`Painter`.
-        model: See :class:`Painter`.
-        atlas: See :class:`Painter`.
-        functions: The kernels.
-    """
+    """Draws with kernels. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
@@ -140,10 +131,8 @@ class Compiler:
     """Compiles the kernels once for this process, on a separate thread.
 
     At its end the process waits only for the function being compiled at that moment, not for all of them, because LLVM
-    must not be torn down while it works.
-
-    Args:
-        load: Returns kernels that compile on their first call. Raises ``ImportError`` without Numba.
+    must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
+    ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
@@ -190,9 +179,7 @@ class Compiler:
 def load_kernels() -> Kernels:
     """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
-    Raises:
-        ImportError: Numba is not installed.
-        RuntimeError: Numba's cache is not writable, so every start would spend seconds on compilation.
+    RuntimeError if Numba's cache is not writable, so that every start would spend seconds on compilation.
     """
     import numba
 

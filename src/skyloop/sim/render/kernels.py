@@ -1,7 +1,7 @@
 """The planar renderer's work as loops over quads and pixels that Numba can compile (``compiled``).
 
-The loops compute the same as ``visibility`` and ``shading``, operation by operation in the same order and precision, so
-the image is identical bit by bit; those modules explain the mathematics. They also run uncompiled, slowly, for tests
+The loops compute the same as ``shading``, operation by operation in the same order and precision, so
+the image is identical bit by bit; that module explains the mathematics. They also run uncompiled, slowly, for tests
 without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
 hold the interpreter lock.
 
@@ -30,46 +30,29 @@ _ROUND = np.float32(3 << 22)  # adding and subtracting this rounds a number up t
 
 
 def prepare(
-    vectors: Floats,
-    starts: Floats,
-    two_sided: NDArray[np.bool_],
-    lit: NDArray[np.bool_],
-    shown: NDArray[np.bool_],
-    weight: Floats,
-    density: Floats,
-    origin: Floats,
-    position: Floats,
-    rotation: Floats,
+    vectors: Floats,  # see ``Quads``, also for the next three
+    starts: Floats,  # see ``Quads``
+    two_sided: NDArray[np.bool_],  # see ``Quads``
+    lit: NDArray[np.bool_],  # see ``Quads``
+    shown: NDArray[np.bool_],  # whether to draw a quad at all, (n,)
+    weight: Floats,  # factor on each quad's inverse depth, from its priority, (n,)
+    density: Floats,  # see ``Quads``
+    origin: Floats,  # x, y and span in the atlas of each quad's texture, (n, 3)
+    position: Floats,  # position of the camera
+    rotation: Floats,  # rotation from optical to world axes
+    # edge-on limit [m], ambient light, direct light, unit of light, factor of the footprint, direction to the light,
+    # unit
     constants: Floats,
-    grid: Floats,
-    pixel_area: float,
+    grid: Floats,  # width, height, fx, fy, cx, cy
+    pixel_area: float,  # 1/(fx fy) of the image
+    # output: planes through the edges of each selected quad, as slopes on the grid along x and y, and start, (n, 4, 3)
     edges: Floats,
-    planes: Floats,
+    planes: Floats,  # output: each selected quad's 1/z on the grid as slope along x, slope along y and start, (n, 3)
+    # output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4)
     box: NDArray[np.int64],
-    table: Singles,
+    table: Singles,  # output: see ``sampling_table``, (13, n + 1)
 ) -> int:
     """Select the quads that may be visible, like ``visible_quads`` and ``sampling_table``.
-
-    Args:
-        vectors: See ``Quads``, also for the next three.
-        starts: See ``Quads``.
-        two_sided: See ``Quads``.
-        lit: See ``Quads``.
-        shown: Whether to draw a quad at all, (n,).
-        weight: Factor on each quad's inverse depth, from its priority, (n,).
-        density: See ``Quads``.
-        origin: x, y and span in the atlas of each quad's texture, (n, 3).
-        position: Position of the camera.
-        rotation: Rotation from optical to world axes.
-        constants: Edge-on limit [m], ambient light, direct light, unit of light, factor of the footprint,
-            direction to the light, unit.
-        grid: width, height, fx, fy, cx, cy.
-        pixel_area: 1/(fx fy) of the image.
-        edges: Output: planes through the edges of each selected quad, as slopes on the grid along x and y, and start,
-            (n, 4, 3).
-        planes: Output: each selected quad's 1/z on the grid as slope along x, slope along y and start, (n, 3).
-        box: Output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4).
-        table: Output: see ``sampling_table``, (13, n + 1).
 
     Returns:
         The number of selected quads.
@@ -155,64 +138,41 @@ def prepare(
 
 
 def draw(
-    count: int,
-    edges: Floats,
-    planes: Floats,
-    box: NDArray[np.int64],
-    table: Singles,
-    samples: int,
-    to_grid: Singles,
-    rows_for: NDArray[np.int64],
-    ray_x: Singles,
-    ray_y: Singles,
-    sample_x: Singles,
-    sample_y: Singles,
-    nearest: Singles,
-    numbers: NDArray[np.int32],
+    count: int,  # the result of :func:`prepare`, which also wrote the next four arguments
+    edges: Floats,  # see :func:`prepare`
+    planes: Floats,  # see :func:`prepare`
+    box: NDArray[np.int64],  # see :func:`prepare`
+    table: Singles,  # see :func:`prepare`
+    samples: int,  # samples per pixel, 1 or 4
+    to_grid: Singles,  # see ``Raster``
+    rows_for: NDArray[np.int64],  # number of grid rows needed for each row of the image, (height,)
+    ray_x: Singles,  # x of each pixel's ray (x, y, 1), (height, width)
+    ray_y: Singles,  # y of each pixel's ray, (height, width)
+    sample_x: Singles,  # x of the ray of each column of the grid
+    sample_y: Singles,  # y of the ray of each row of the grid
+    nearest: Singles,  # work array: 1/z at each sample of a band, (BAND, columns)
+    numbers: NDArray[np.int32],  # work array, (BAND, columns)
+    # Work array: the table's column for each sample, 0 for none, with the sign bit set if a sample may differ from its
+    # neighbours to the right and below. Holds the last processed grid rows, as many as the image needs at a time; a
+    # power of two. (rows, columns).
     seen: Shorts,
-    pairs: NDArray[np.int64],
-    atlas_size: tuple[int, int],
-    gap: float,
-    farthest: float,
+    pairs: NDArray[np.int64],  # the atlas: each texel and the next one, BGRA each, in one number
+    atlas_size: tuple[int, int],  # number of rows and columns of the atlas
+    gap: float,  # gap between two levels of a texture in the atlas [texels]
+    farthest: float,  # 1/z to assume for a ray beyond a quad's horizon [1/m]
+    # box of each shadow: first row, row after the last, first column, column after the last, (s, 4)
     boxes: NDArray[np.int64],
-    axes: Singles,
+    axes: Singles,  # rotation from optical to world axes
+    # numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it, (s, 7)
     shadows: Singles,
-    picture: NDArray[np.uint8],
+    picture: NDArray[np.uint8],  # output: BGR, (height, width, 3)
+    # the image's memory as one number per pixel except the last, at intervals of three bytes
     packed: NDArray[np.int32],
 ) -> None:
     """Draw an image like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
     For each band of the grid, find the nearest quad at each sample. Then colour the image rows that need no further
     bands, while this band is still in the cache.
-
-    Args:
-        count: The result of :func:`prepare`, which also wrote the next four arguments.
-        edges: See :func:`prepare`.
-        planes: See :func:`prepare`.
-        box: See :func:`prepare`.
-        table: See :func:`prepare`.
-        samples: Samples per pixel, 1 or 4.
-        to_grid: See ``Raster``.
-        rows_for: Number of grid rows needed for each row of the image, (height,).
-        ray_x: x of each pixel's ray (x, y, 1), (height, width).
-        ray_y: y of each pixel's ray, (height, width).
-        sample_x: x of the ray of each column of the grid.
-        sample_y: y of the ray of each row of the grid.
-        nearest: Work array: 1/z at each sample of a band, (BAND, columns).
-        numbers: Work array, (BAND, columns).
-        seen: Work array: the table's column for each sample, 0 for none, with the sign bit set if a sample may differ
-            from its neighbours to the right and below. Holds the last processed grid rows, as many as the image needs
-            at a time; a power of two. (rows, columns).
-        pairs: The atlas: each texel and the next one, BGRA each, in one number.
-        atlas_size: Number of rows and columns of the atlas.
-        gap: Gap between two levels of a texture in the atlas [texels].
-        farthest: 1/z to assume for a ray beyond a quad's horizon [1/m].
-        boxes: Box of each shadow: first row, row after the last, first column, column after the last, (s, 4).
-        axes: Rotation from optical to world axes.
-        shadows: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it,
-            (s, 7).
-        picture: Output: BGR, (height, width, 3).
-        packed: The image's memory as one number per pixel except the last, at intervals of three bytes.
     """
     zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
     three, parts = np.float32(3.0), np.float32(32.0)  # a texel is divided into 32 parts along each side

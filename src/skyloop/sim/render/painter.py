@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraModel, CameraPose, Distortion
-from skyloop.sim.render.base import Image, cv2
-from skyloop.sim.render.quads import Atlas, Quads
-from skyloop.sim.render.shading import Placed, Rays, Shader, darken, sampling_table
-from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
+from skyloop.sim.render.quads import Atlas, Image, Quads, cv2
+from skyloop.sim.render.shading import DepthBuffer, Grid, Placed, Rays, Shader, darken, sampling_table, visible_quads
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,35 +23,23 @@ class Raster:
 
     A pixel has one sample, the grid point nearest to its centre, or the four around its centre. Without distortion,
     these are exactly a quarter of a pixel to each side.
-
-    Attributes:
-        grid: The grid.
-        samples: Samples per pixel: 1 or 4.
-        lookup: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two
-            below these.
-        to_grid: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the
-            start, gives the column and row of its first sample after truncation. Computed in single precision, like
-            ``lookup``.
-        sample_x: x/z of each column of the grid.
-        sample_y: y/z of each row of the grid.
-        rays: Rays of the pixels' centres.
     """
 
     grid: Grid
-    samples: int
+    samples: int  #: samples per pixel: 1 or 4
+    #: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two below
+    #: these.
     lookup: NDArray[np.int32]
+    #: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the start,
+    #: gives the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
     to_grid: NDArray[np.float32]
-    sample_x: NDArray[np.float32]
-    sample_y: NDArray[np.float32]
-    rays: Rays
+    sample_x: NDArray[np.float32]  #: x/z of each column of the grid
+    sample_y: NDArray[np.float32]  #: y/z of each row of the grid
+    rays: Rays  #: rays of the pixels' centres
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion.
-
-        Raises:
-            UsageError: The model's distortion can't be inverted.
-        """
+        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion."""
         return _raster(model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
 
 
@@ -93,13 +79,7 @@ def _rays(model: CameraModel) -> NDArray[np.float64]:
 
 
 class Painter(ABC):
-    """Draws through one lens. It reuses buffers, so use it from one thread at a time.
-
-    Args:
-        raster: The lens's raster.
-        model: The lens.
-        atlas: Textures of the scene.
-    """
+    """Draws through one lens. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
         self.raster = raster
@@ -110,15 +90,7 @@ class Painter(ABC):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """Draw an image.
-
-        Args:
-            quads: The scene's quads.
-            shown: Whether to draw each quad at all, (n,).
-            shadows: The shadows.
-            pose: The camera's pose.
-            picture: Output: BGR, (height, width, 3), contiguous.
-        """
+        """Draw the ``shown`` quads, (n,), and the shadows into ``picture``: BGR, (height, width, 3), contiguous."""
 
 
 class PlainPainter(Painter):

@@ -1,6 +1,6 @@
 """The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
 
-The first step finds the quad at each sample of the image (``visibility``); the second colours each pixel once
+The first step finds the quad at each sample of the image, and the second colours each pixel once
 (``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
 coloured and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens:
 nothing is resampled, and textures stay sharp.
@@ -13,7 +13,6 @@ model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 from typing import Final
@@ -23,15 +22,14 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.sim.camera import CameraModel, CameraPose
-from skyloop.sim.render.base import Image, SceneState, cv2
 from skyloop.sim.render.compiled import COMPILER, CompiledPainter, Compiler
 from skyloop.sim.render.painter import Painter, PlainPainter, Raster
+from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
-WORTH_COMPILING: Final = (
-    30  #: images that a renderer draws before; for fewer, compilation would take longer than it saves
-)
+#: Number of images that a renderer draws before; for fewer, compilation would take longer than it saves.
+WORTH_COMPILING: Final = 30
 
 
 class Quality(Enum):
@@ -65,12 +63,7 @@ class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
     :class:`SensorEffects` adds the latter. The renderer reuses buffers, so use it from one thread at a time. Several
-    renderers can share a scene.
-
-    Args:
-        scene: The scene.
-        quality: Sampling quality.
-        compiler: Compiler for compiled drawing; None to always draw without it.
+    renderers can share a scene. Without a compiler it never draws with compiled code.
     """
 
     def __init__(
@@ -80,24 +73,11 @@ class PlanarRenderer:
         self.quality = quality
         self._compiler = compiler
         self._pictures = 0
-        self._lenses: dict[tuple[object, ...], _Lens] = {}
+        self._painters: dict[tuple[object, ...], Painter] = {}  # by lens
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """Render an image.
-
-        Args:
-            state: The poses of all moving objects.
-            pose: The camera's pose.
-            model: The camera's model.
-            out: Array for the image; None creates one.
-
-        Returns:
-            The image, BGR, shape (model.height, model.width, 3), uint8.
-
-        Raises:
-            UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.
-        """
+        """Render an image, BGR, (model.height, model.width, 3), uint8, into ``out`` if given."""
         shape = (model.height, model.width, 3)
         if out is None:
             out = np.empty(shape, np.uint8)
@@ -122,34 +102,29 @@ class PlanarRenderer:
             np.copyto(out, whole)
 
     def _draw(self, state: SceneState, pose: CameraPose, model: CameraModel, samples: int, picture: Image) -> None:
-        lens = self._lens(model, samples)
+        painter = self._painter(model, samples)
         posed = self._pose(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
-        shadows = [at for shadow in posed.shadows if (at := placed(shadow, pose, lens.raster.rays)) is not None]
-        self._painter(lens).paint(posed.quads, shown, shadows, pose, picture)
+        shadows = [at for shadow in posed.shadows if (at := placed(shadow, pose, painter.raster.rays)) is not None]
+        painter.paint(posed.quads, shown, shadows, pose, picture)
 
     def _pose(self, state: SceneState) -> Posed:
         if self._posed is None or self._posed[0] is not state:
             self._posed = (state, self.scene.posed(state))
         return self._posed[1]
 
-    def _painter(self, lens: _Lens) -> Painter:
+    def _painter(self, model: CameraModel, samples: int) -> Painter:
+        key = (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
+        painter = self._painters.get(key)
+        if painter is None:
+            painter = self._painters[key] = PlainPainter(Raster.of(model, samples), model, self.scene.atlas)
         self._pictures += 1
-        if not lens.compiled and self._compiler is not None:
+        if self._compiler is not None and not isinstance(painter, CompiledPainter):
             if self._pictures > WORTH_COMPILING:
                 self._compiler.start()
-            kernels = self._compiler.kernels
-            if kernels is not None:
-                lens.painter = CompiledPainter(lens.raster, lens.model, self.scene.atlas, kernels)
-                lens.compiled = True
-        return lens.painter
-
-    def _lens(self, model: CameraModel, samples: int) -> _Lens:
-        key = (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
-        if key not in self._lenses:
-            raster = Raster.of(model, samples)
-            self._lenses[key] = _Lens(model, raster, PlainPainter(raster, model, self.scene.atlas))
-        return self._lenses[key]
+            if (kernels := self._compiler.kernels) is not None:
+                painter = self._painters[key] = CompiledPainter(painter.raster, model, self.scene.atlas, kernels)
+        return painter
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
@@ -162,14 +137,6 @@ def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
 
 def _samples(quality: Quality) -> int:
     return 4 if quality is Quality.SMOOTH else 1
-
-
-@dataclass(slots=True)
-class _Lens:
-    model: CameraModel
-    raster: Raster
-    painter: Painter
-    compiled: bool = False
 
 
 @lru_cache(maxsize=16)
@@ -199,16 +166,10 @@ class SensorEffects:
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Apply the flaws to an image in place and return it.
+        """Apply the flaws to a BGR image of the camera's size, in place, and return it.
 
-        Args:
-            picture: BGR image of the camera's size.
-            number: The frame's number.
-            body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
-                which blurs the image over the exposure; None for a drone that does not turn.
-
-        Raises:
-            UsageError: The image has a different size.
+        The drone's angular velocity about its body axes (x forward, y left, z up), (3,), blurs the image over the
+        exposure; None for a drone that does not turn. ``number`` is the frame's.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):

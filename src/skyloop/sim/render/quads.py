@@ -1,6 +1,6 @@
-"""Textured convex quadrilaterals as arrays, the shapes made from them, and one image with all their textures.
+"""The renderer's input and output, and textured convex quadrilaterals as arrays, with shapes and their textures.
 
-Each texture has its smaller versions (mip levels) next to it.
+All textures are in one image, each with its smaller versions (mip levels) next to it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,33 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyloop.sim.render.base import cv2
+from skyloop.errors import MissingExtraError
+from skyloop.sim.world import TargetState
+
+try:
+    import cv2
+except ImportError as error:
+    raise MissingExtraError("the simulator", "sim", cause=str(error)) from error
+
+__all__ = ["cv2"]  # handed on; all else is this module's own
+
+Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneState:
+    """The poses of all moving objects at a point in time.
+
+    The renderer may cache results for as long as it receives the same state object, so don't write to a state's arrays
+    afterwards.
+    """
+
+    drone_positions_m: NDArray[np.float64]  #: positions of the bodies' origins in world axes, shape (n, 3)
+    drone_rotations: NDArray[np.float64]  #: world from body, shape (n, 3, 3)
+    targets: tuple[TargetState, ...] = ()  #: one state for each target in the world, in the world's order
+    #: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
+    light: float = 1.0
+
 
 LEVELS = 7
 BORDER = 4  # pixels repeated around each level, so that interpolation at the rim stays within the level
@@ -31,19 +57,12 @@ class Texture:
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """All textures in one image.
+    """All textures in one image."""
 
-    Attributes:
-        image: The image, BGRA (OpenCV samples four channels twice as fast as three).
-        x0: Column where each texture's level 0 starts; float64, shape (number of textures,).
-        y0: Row where each texture's level 0 starts, likewise.
-        span: Twice the padded width of each texture.
-    """
-
-    image: NDArray[np.uint8]
-    x0: NDArray[np.float64]
-    y0: NDArray[np.float64]
-    span: NDArray[np.float64]
+    image: NDArray[np.uint8]  #: the image, BGRA (OpenCV samples four channels twice as fast as three)
+    x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
+    y0: NDArray[np.float64]  #: row where each texture's level 0 starts, likewise
+    span: NDArray[np.float64]  #: twice the padded width of each texture
 
 
 class AtlasBuilder:
@@ -51,24 +70,19 @@ class AtlasBuilder:
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
-        self._images: list[NDArray[np.uint8]] = []
+        self.images: list[Image] = []  #: textures so far by number, BGR, shape (h, w, 3)
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
         """Return the texture for ``key``. If there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
-            self._known[key] = Texture(len(self._images), image.shape[1], image.shape[0])
-            self._images.append(image)
+            self._known[key] = Texture(len(self.images), image.shape[1], image.shape[0])
+            self.images.append(image)
         return self._known[key]
-
-    @property
-    def images(self) -> list[NDArray[np.uint8]]:
-        """Return the textures so far in the order of their numbers, BGR, shape (h, w, 3)."""
-        return self._images
 
     def pack(self) -> Atlas:
         """Pack all textures on shelves, starting with the tallest."""
-        sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self._images]
+        sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self.images]
         width = max(2048, *(_footprint(w) for w, _ in sizes))
         spots: dict[int, tuple[int, int]] = {}
         x = y = shelf = 0
@@ -83,7 +97,7 @@ class AtlasBuilder:
         if width > _LIMIT or height > _LIMIT:
             raise ValueError(f"the scene's textures need {width}x{height} texels, more than {_LIMIT} a side")
         image = np.zeros((height, width, 4), np.uint8)
-        for k, source in enumerate(self._images):
+        for k, source in enumerate(self.images):
             _place(image, source, *spots[k], *sizes[k])
         corners = np.array([spots[k] for k in range(len(sizes))], dtype=np.float64)
         span = np.array([2.0 * w for w, _ in sizes])
@@ -212,17 +226,10 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a rectangle, described as seen from the front.
+        """Add a rectangle as seen from the front: its lower left corner and its edges to the right and upwards [m].
 
-        Args:
-            lower_left: The lower left corner [m].
-            right: The edge to the right [m].
-            up: The edge upwards [m].
-            texture: The rectangle's texture.
-            two_sided: Whether it is also visible from behind.
-            priority: Priority; the quad with the highest one in a plane is visible.
-            lit: Whether it is brighter when facing the light.
-            uv: The visible part of the texture (left, top, right, bottom in texels); None for all of it.
+        The quad with the highest priority in a plane is visible; a ``lit`` one is brighter when facing the light.
+        ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -262,19 +269,12 @@ class QuadBuilder:
         )
 
     def box(
-        self,
-        low: ArrayLike,
-        high: ArrayLike,
-        sides: Texture | tuple[Texture, Texture],
-        ends: Texture | None = None,
+        self, low: ArrayLike, high: ArrayLike, sides: Texture | tuple[Texture, Texture], ends: Texture | None = None
     ) -> None:
-        """Add an upright box that is visible from outside.
+        """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 
-        Args:
-            low: Its lowest corner [m].
-            high: Its highest corner [m].
-            sides: Texture of the four sides, or a pair for the sides facing along x and along y.
-            ends: Texture of the top and bottom; None for that of the sides facing along x.
+        A pair of ``sides`` is for those facing along x and along y. ``ends`` are top and bottom; None for the texture
+        along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.sim.render import models
-from skyloop.sim.render.base import SceneState, cv2
-from skyloop.sim.render.figures import figure
-from skyloop.sim.render.models import card
-from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads, Texture, concatenate, move_each
+from skyloop.sim.render.models import card, figure
+from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads, SceneState, Texture, concatenate, cv2, move_each
 from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import BoardTarget, Box, FigureTarget, PlatformTarget, Room, World
@@ -36,9 +34,6 @@ class Scene:
 
     Building it draws all textures (some tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
-
-    Raises:
-        UsageError: A texture, a marker dictionary or an id does not exist.
     """
 
     def __init__(self, world: World, drones: int = 1) -> None:
@@ -93,11 +88,7 @@ class Scene:
         ]
 
     def posed(self, state: SceneState) -> Posed:
-        """Place all moving parts according to a state.
-
-        Raises:
-            UsageError: The state has a different number of drones or targets.
-        """
+        """Place all moving parts according to a state."""
         shape = np.shape(state.drone_positions_m), np.shape(state.drone_rotations)
         if shape != ((self.drones, 3), (self.drones, 3, 3)):
             raise UsageError(
@@ -164,12 +155,7 @@ _LEAN = np.array([-0.16, 0.20])
 
 
 def static_quads(world: World, atlas: AtlasBuilder) -> Quads:
-    """Return all fixed parts of a world.
-
-    Args:
-        world: The world.
-        atlas: Receives the textures.
-    """
+    """Return all fixed parts of a world."""
     parts = [_shell(world, atlas, world.solids())]
     parts += [_box(box, atlas) for box in world.solids()]
     for panel in world.panels:
@@ -298,12 +284,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
     """Add the ground around the room's floor, as far as it is visible, and a sky."""
     x, y, far = room.size_m[0] / 2, room.size_m[1] / 2, _AFAR_M
     ground = _surface(atlas, room.floor, 2 * far, 2 * far, 512 / (2 * far))
-    for low, high in (
-        ((-far, -far), (far, -y)),
-        ((-far, y), (far, far)),
-        ((-far, -y), (-x, y)),
-        ((x, -y), (far, y)),
-    ):
+    for low, high in (((-far, -far), (far, -y)), ((-far, y), (far, far)), ((-far, -y), (-x, y)), ((x, -y), (far, y))):
         if high[0] <= low[0] or high[1] <= low[1]:
             continue  # the floor extends this far
         texels = ground.width / (2 * far)

@@ -1,4 +1,12 @@
-"""Colouring of samples whose quads are known, and soft shadows."""
+"""Finding the quad visible at each sample of an image, and colouring the samples, with soft shadows.
+
+Quads are found by geometry without clipping and a depth buffer. A ray r through the eye meets a convex polygon in front
+of the eye exactly if it is on the inner side of every plane through the eye and an edge: (v_i × v_{i+1}) · r has the
+same sign for all edges. This also holds for corners behind the eye, so nothing is clipped and no wall is lost at a
+grazing angle. On one row of the image, each edge becomes a bound on x. Across the image, 1/z is linear:
+1/z = (n · r) / (n · v_0). Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates",
+Graphics Hardware 1997.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +16,165 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.camera import CameraPose
-from skyloop.sim.render.base import cv2
-from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads
-from skyloop.sim.render.visibility import View, dot, turned
+from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
+
+# How much closer a picture counts than the wall behind it, per step of priority, as a fraction of the distance.
+PRIORITY_SHARE = 1e-3
+# Maximum distance of the eye from the plane of a quad that is edge-on and covers nothing visible [m].
+EDGE_ON_M = 1e-5
+_BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Samples of a distortion-free image plane, where sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The quads that may be visible from a pose, and their position on the grid. All arrays have m as their first axis.
+
+    ``index``: numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
+    ``height_m``: signed height of the eye above the plane, (m,). ``first``, ``end``: columns covered in each row,
+    (m, height). ``box``: bounds x0, y0, x1, y1, (m, 4).
+    """
+
+    index: NDArray[np.intp]
+    inverse_depth: Floats
+    height_m: Floats
+    first: NDArray[np.int16]
+    end: NDArray[np.int16]
+    box: NDArray[np.intp]
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Return a · b along the last axis of three, summed in order: independent of libraries, so always the same bits."""
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
+
+
+def turned(vectors: Floats, rotation: Floats) -> Floats:
+    """Return vectors, shape (…, 3), multiplied by a rotation from the right, with sums as in :func:`dot`."""
+    return np.stack([dot(vectors, rotation[:, axis]) for axis in range(3)], axis=-1)
+
+
+def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
+    """Return those of the ``shown`` quads, (n,), that are individually visible from a pose through a grid.
+
+    :class:`DepthBuffer` handles occlusion.
+    """
+    height_m = dot(quads.normals, pose.position_m - quads.corners[:, 0])
+    facing = (height_m > EDGE_ON_M) | (quads.two_sided & (height_m < -EDGE_ON_M))
+    index = np.flatnonzero(facing & shown)
+    corners = turned(quads.corners[index] - pose.position_m, pose.rotation)
+    inside = _touches_view(corners, grid)
+    index, corners = index[inside], corners[inside]
+    height_m = height_m[index]
+    edges = np.cross(corners, np.roll(corners, -1, axis=1)) * -np.sign(height_m)[:, None, None]
+    first, end = _columns(edges, grid)
+    covered = end > first
+    seen = covered.any(axis=1)
+    index, height_m, first, end, covered = index[seen], height_m[seen], first[seen], end[seen], covered[seen]
+    box = np.empty((len(index), 4), np.intp)
+    if len(index):
+        box[:, 0] = np.where(covered, first, grid.width).min(axis=1)
+        box[:, 1] = covered.argmax(axis=1)
+        box[:, 2] = np.where(covered, end, 0).max(axis=1)
+        box[:, 3] = grid.height - covered[:, ::-1].argmax(axis=1)
+    inverse_depth = turned(quads.normals[index], pose.rotation) / -height_m[:, None]
+    return View(index, inverse_depth, height_m, first, end, box)
+
+
+def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
+    """Return False for quads entirely beyond one side of the view or behind the eye. Corners (m, 4, 3) are optical."""
+    x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
+    left, right = -(0.5 + grid.cx) / grid.fx, (grid.width - 0.5 - grid.cx) / grid.fx
+    top, bottom = -(0.5 + grid.cy) / grid.fy, (grid.height - 0.5 - grid.cy) / grid.fy
+    beyond = (x < left * z).all(axis=1) | (x > right * z).all(axis=1)
+    beyond |= (y < top * z).all(axis=1) | (y > bottom * z).all(axis=1)
+    return np.asarray(~(beyond | (z <= 0.0).all(axis=1)))
+
+
+def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Return the first and one-past-last column in each row, (m, height), inside edge planes, (m, 4, 3)."""
+    slope_x = edges[..., 0] / grid.fx
+    slope_y = edges[..., 1] / grid.fy
+    start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
+    # An exactly level edge bounds no columns; with this tiny slope it includes all or none of a row.
+    slope_x[slope_x == 0.0] = 1e-30
+    crossing = (slope_y / -slope_x)[..., None] * np.arange(grid.height) + (start / -slope_x)[..., None]
+    rising = (slope_x > 0.0)[..., None]
+    low = np.where(rising, crossing, -1.0).max(axis=1)
+    high = np.where(rising, float(grid.width), crossing).min(axis=1)
+    first = np.ceil(np.clip(low, 0.0, grid.width)).astype(np.int16)
+    end = np.floor(np.clip(high, -1.0, grid.width - 1)).astype(np.int16) + np.int16(1)
+    return first, end
+
+
+class DepthBuffer:
+    """Finds the nearest quad at each sample."""
+
+    def __init__(self, grid: Grid) -> None:
+        shape = (grid.height, grid.width)
+        self._grid = grid
+        self._columns = np.arange(grid.width, dtype=np.int16)[None, :]
+        self._nearest = np.empty(shape, np.float32)
+        working = max(_BAND, grid.width)
+        self._candidate = np.empty(working, np.float32)
+        self._number = np.empty(working, np.int32)
+        self._mask = np.empty(working, np.uint8)
+        self._scratch = np.empty(working, np.bool_)
+        #: Index in the view of the quad at each sample plus one, 0 for none; int32, shape (height, width). Overwritten
+        #: by the next :meth:`draw`.
+        self.seen = np.empty(shape, np.int32)
+
+    def draw(self, view: View, priority: NDArray[np.intp]) -> None:
+        """Update :attr:`seen`. ``priority``: that of each quad in the view, (m,)."""
+        grid = self._grid
+        slope = view.inverse_depth * (1.0 + PRIORITY_SHARE * priority)[:, None] / (grid.fx, grid.fy, 1.0)
+        start = slope[:, 2] - slope[:, 0] * grid.cx - slope[:, 1] * grid.cy
+        along_x = (slope[:, :1] * np.arange(grid.width)).astype(np.float32)
+        along_y = (slope[:, 1:2] * np.arange(grid.height) + start[:, None]).astype(np.float32)
+        self._nearest.fill(0.0)
+        self.seen.fill(0)
+        for k, (x0, y0, x1, y1) in enumerate(view.box.tolist()):
+            band = max(1, _BAND // (x1 - x0))
+            for top in range(y0, y1, band):
+                self._draw_band(view, k, along_x[k], along_y[k], (x0, top, x1, min(top + band, y1)))
+
+    def _draw_band(
+        self,
+        view: View,
+        k: int,
+        along_x: NDArray[np.float32],
+        along_y: NDArray[np.float32],
+        box: tuple[int, int, int, int],
+    ) -> None:
+        """Draw the part of a quad within a box wherever it is closer than earlier quads."""
+        x0, y0, x1, y1 = box
+        size = (y1 - y0) * (x1 - x0)
+        shape = (y1 - y0, x1 - x0)
+        candidate, mask = self._candidate[:size].reshape(shape), self._mask[:size].reshape(shape)
+        scratch, number = self._scratch[:size].reshape(shape), self._number[:size].reshape(shape)
+        flags = mask.view(np.bool_)
+        nearest = self._nearest[y0:y1, x0:x1]
+        columns = self._columns[:, x0:x1]
+        np.add(along_x[None, x0:x1], along_y[y0:y1, None], out=candidate)
+        np.greater(candidate, nearest, out=flags)
+        np.greater_equal(columns, view.first[k, y0:y1, None], out=scratch)
+        np.logical_and(flags, scratch, out=flags)
+        np.less(columns, view.end[k, y0:y1, None], out=scratch)
+        np.logical_and(flags, scratch, out=flags)
+        number.fill(k + 1)
+        cv2.copyTo(candidate, mask, nearest)
+        cv2.copyTo(number, mask, self.seen[y0:y1, x0:x1])
+
 
 CHUNK = 16384  # samples per batch: few enough for the working arrays to stay in the cache
 
@@ -77,15 +241,9 @@ class Shader:
         colours: NDArray[np.uint8],
         inverse_depth: NDArray[np.float32],
     ) -> None:
-        """Write the samples' colours and inverse depths.
+        """Write the samples' colours, BGRA, (n, 4), and inverse depths [1/m], (n,), to the last two arguments.
 
-        Args:
-            table: The table from :func:`sampling_table`.
-            seen: The table's column for each sample, (n,).
-            ray_x: x of the ray (x, y, 1), (n,).
-            ray_y: y of the ray, (n,).
-            colours: Output: colours, BGRA, shape (n, 4).
-            inverse_depth: Output: inverse depths [1/m], (n,).
+        ``seen`` is each sample's column in the table from :func:`sampling_table`, (n,), and its ray is (x, y, 1).
         """
         for start in range(0, len(seen), CHUNK):
             part = slice(start, min(start + CHUNK, len(seen)))
@@ -160,17 +318,11 @@ _NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A level round spot that gets less light.
+    """A level round spot that gets less light."""
 
-    Attributes:
-        centre_m: Centre in world axes.
-        radius_m: Radius of the edge.
-        strength: Fraction of the light missing in the middle, 0 to 1.
-    """
-
-    centre_m: NDArray[np.float64]
-    radius_m: float
-    strength: float
+    centre_m: NDArray[np.float64]  #: centre in world axes
+    radius_m: float  #: radius of the edge
+    strength: float  #: fraction of the light missing in the middle, 0 to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,17 +365,13 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A shadow in a camera's view.
+    """A shadow in a camera's view."""
 
-    Attributes:
-        box: First row that may show the shadow, row after the last, first column, column after the last.
-        axes: Rotation from optical to world axes.
-        numbers: Its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius
-            [m²]; strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m].
-    """
-
+    #: first row that may show the shadow, row after the last, first column, column after the last
     box: tuple[int, int, int, int]
-    axes: NDArray[np.float32]
+    axes: NDArray[np.float32]  #: rotation from optical to world axes
+    #: its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius [m²];
+    #: strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m]
     numbers: NDArray[np.float32]
 
 
@@ -243,14 +391,7 @@ def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
 
 
 def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth: NDArray[np.float32]) -> None:
-    """Darken the pixels of an image that show the area of a shadow.
-
-    Args:
-        picture: BGR image, (height, width, 3), changed in place.
-        shadow: The shadow.
-        rays: The lens's rays.
-        inverse_depth: Inverse depth of each pixel [1/m], (height, width).
-    """
+    """Darken the pixels of a BGR image that show the area of a shadow, by the inverse depth of each pixel [1/m]."""
     top, bottom, left, right = shadow.box
     part = slice(top, bottom), slice(left, right)
     x, y, depth = rays.x[part], rays.y[part], 1.0 / inverse_depth[part]
@@ -269,9 +410,7 @@ def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth
 def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float, float]]:
     """Return x/z and y/z of the corners of the part of a square that is more than 1 cm ahead, in optical axes.
 
-    Args:
-        centre: The square's centre [m].
-        sides: Vectors from the centre to the middles of two sides [m].
+    ``sides`` are the vectors from its centre to the middles of two sides [m].
     """
     (ax, ay, az), (bx, by, bz) = sides
     signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

@@ -11,9 +11,8 @@ from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.messages.parameter import WORLD, encode_world
 from skyloop.sim.camera import CameraModel
-from skyloop.sim.geometry import geometry_of
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
-from skyloop.sim.world import Room, Wind, World
+from skyloop.sim.world import Room, Wind, World, geometry_of
 from skyloop.zones import ROOM, Box
 
 #: Each limit's parameter, field in :class:`Limits`, unit and description.

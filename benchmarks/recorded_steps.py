@@ -55,19 +55,12 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A recorded flight. Times are in seconds of the clock that stamped them.
+    """A recorded flight. Times are in seconds of the clock that stamped them."""
 
-    Attributes:
-        name: The folder's name.
-        command: Command as recorded, but positive for nose down.
-        pitch: Pitch, positive for nose down [rad].
-        forward: Forward speed [m/s].
-    """
-
-    name: str
-    command: Track
-    pitch: Track
-    forward: Track
+    name: str  #: the folder's name
+    command: Track  #: command as recorded, but positive for nose down
+    pitch: Track  #: pitch, positive for nose down [rad]
+    forward: Track  #: forward speed [m/s]
 
     def steps(self) -> list[float]:
         """Times at which the command changed [s]."""
@@ -82,29 +75,19 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The motion of simulated vehicles, with one row per vehicle.
+    """The motion of simulated vehicles, with one row per vehicle."""
 
-    Attributes:
-        times_s: Times after the start of the step.
-        pitch: Pitch, shape (vehicles, samples) [rad].
-        forward: Forward speed, shape (vehicles, samples) [m/s].
-    """
-
-    times_s: Floats
-    pitch: Floats
-    forward: Floats
+    times_s: Floats  #: times after the start of the step
+    pitch: Floats  #: pitch, shape (vehicles, samples) [rad]
+    forward: Floats  #: forward speed, shape (vehicles, samples) [m/s]
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedEstimate:
-    """A first-order model of the recorded drone's speed estimate.
+    """A first-order model of the recorded drone's speed estimate."""
 
-    Attributes:
-        lag_s: Time constant [s].
-        scale: Factor of the estimate. In the recordings, a pitch that reads too small by as much looks the same.
-    """
-
-    lag_s: float
+    lag_s: float  #: time constant [s]
+    #: Factor of the estimate. In the recordings, a pitch that reads too small by as much looks the same.
     scale: float
 
     def of(self, response: Response) -> Floats:
@@ -192,14 +175,6 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
 
     Each vehicle hovers and, from time 0 on, gets the command as its pitch set-point. Magnitudes from
     :data:`FULL_TILT_COMMAND` on mean the tilt limit. A command of 0 is a level set-point, which differs from hovering.
-
-    Args:
-        command: The command, positive for nose down.
-        vehicles: The vehicles, at least one.
-        duration_s: Duration of the flight.
-
-    Raises:
-        UsageError: There are no vehicles, or more than fit into the world.
     """
     if not vehicles:
         raise UsageError("give at least one vehicle")
