@@ -20,8 +20,15 @@ from skyloop.transport.local import packets
 from skyloop.transport.local.frame_exchange import MAX_LEASES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
-SECTIONS = re.compile(r"^### (\w+)(?: — (kind|tag) (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
-FOUND = {name: (word, number, body) for name, word, number, body in SECTIONS.findall(PAGE)}
+SECTIONS = re.compile(r"^### (\w+)(?: — kind (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
+FOUND = {
+    name: (number, body) for name, number, body in SECTIONS.findall(PAGE.partition("\n## The local transport\n")[0])
+}
+#: The tag and the fields of each body: a line such as ``1  Hello  (name str ≤64, role Role) what it is``.
+TAGGED = {
+    name: (tag, [field.split()[0] for field in fields.split(",") if field])
+    for tag, name, fields in re.findall(r"^ *(\d+)  ([A-Z]\w+)(?: +\(([^)]*)\))?.*$", PAGE, re.MULTILINE)
+}
 BODIES = (*typing.get_args(config.AnyRequest), *typing.get_args(config.AnyReply), *typing.get_args(Shape))
 PARTS = (
     messages.Intrinsics,
@@ -37,19 +44,20 @@ VOCABULARIES = [v for v in vars(messages).values() if isinstance(v, EnumMeta) an
 
 @pytest.mark.parametrize("struct", STRUCTS, ids=lambda s: s.__name__)
 def test_each_table_lists_the_fields_in_order(struct: type[msgspec.Struct]) -> None:
-    word, number, body = FOUND[struct.__name__]
     tag = struct.__struct_config__.tag
-    first = 0 if tag is None else 1
-    rows = re.findall(r"^\| (\d+) \| `(\w+)` \|", body, re.MULTILINE)
-    assert rows == [(str(index + first), field) for index, field in enumerate(struct.__struct_fields__)]
     if tag is not None:
-        assert (word, number) == ("tag", str(tag))
-    elif struct in codec.KINDS:
-        assert (word, number) == ("kind", str(int(codec.KINDS[struct])))
+        assert TAGGED[struct.__name__] == (str(tag), list(struct.__struct_fields__))
+        return
+    number, body = FOUND[struct.__name__]
+    rows = re.findall(r"^ *(\d+)  (\w+)  ", body, re.MULTILINE)
+    assert rows == [(str(index), field) for index, field in enumerate(struct.__struct_fields__)]
+    if struct in codec.KINDS:
+        assert number == str(int(codec.KINDS[struct]))
 
 
 def test_the_page_describes_nothing_else() -> None:
-    assert set(FOUND) == {struct.__name__ for struct in STRUCTS}
+    assert FOUND.keys() | TAGGED.keys() == {struct.__name__ for struct in STRUCTS}
+    assert not FOUND.keys() & TAGGED.keys()
 
 
 @pytest.mark.parametrize("vocabulary", VOCABULARIES, ids=lambda v: v.__name__)
@@ -63,7 +71,7 @@ def test_sizes_on_the_page() -> None:
     assert f"at most {codec.MAX_BODY:,}".replace(",", " ") in PAGE
     assert codec.SIGNATURE.hex(" ").upper() in PAGE
     assert codec.HEADER_SIZE == 12
-    assert f"| `data` | bin, ≤ {MAX_PIECE:_} |".replace("_", " ") in PAGE
+    assert re.search(rf"^ 8  data +bin ≤{MAX_PIECE} ", PAGE, re.MULTILINE)
 
 
 LOCAL, _, FABRIC = PAGE.partition("\n## The local transport\n")[2].partition("\n## The fabric transport\n")

@@ -70,8 +70,8 @@ def test_numbers_in_the_text() -> None:
     assert f"at most {delivery.DEPTH} packets or {delivery.MAX_BYTES >> 20} MiB" in FABRIC
     assert f"every {delivery.ACKNOWLEDGE_AFTER} packets" in FABRIC
     assert f"At most {frames.WINDOW} frames of a request" in FABRIC
-    assert f"without news for {frames.LOST_NS / 1e9:g} s" in FABRIC
+    assert f"A frame not acknowledged for {frames.LOST_NS / 1e9:g} s" in FABRIC
     assert f"longer by {sealing.TRAILER} bytes" in FABRIC
-    assert f"{sealing.TAG} bytes\nlonger" in FABRIC
+    assert f"{sealing.TAG} bytes longer" in FABRIC
     assert f"more than {sealing.WIDTH} numbers behind" in FABRIC
     assert f"uses it {sealing.SWITCH_S:g} s later" in FABRIC
