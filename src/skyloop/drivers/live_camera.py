@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
 from skyloop.drivers.camera_options import DEVICE_FORMAT, CameraSource
-from skyloop.drivers.live_frames import CheckedRelay, Coded, StreamRelay
-from skyloop.drivers.live_video import Decoder, LiveVideo, Picture, VideoEvent
+from skyloop.drivers.h264 import CheckedRelay, StreamRelay
+from skyloop.drivers.live_video import Coded, Decoder, LiveVideo, Picture, VideoEvent
 from skyloop.errors import MissingExtraError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 

@@ -1,13 +1,14 @@
 """Receive a vehicle's live video, decode it, and show the newest picture.
 
 One thread reads frames from the socket as they arrive, so that pictures don't age in a kernel buffer, and keeps
-reconnecting. Another one decodes the frames that are wanted. Between them, the
-:class:`~skyloop.drivers.live_frames.FrameBacklog` decides which frames to drop when decoding is late.
+reconnecting. Another one decodes the frames that are wanted. Between them, the :class:`FrameBacklog` decides which
+frames to drop when decoding is late.
 """
 
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -18,13 +19,70 @@ from numpy.typing import NDArray
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.drivers.base import Sink
-from skyloop.drivers.live_frames import Coded, FrameBacklog
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
 REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
+LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
+MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
+
+
+@dataclass(frozen=True, slots=True)
+class Coded:
+    """An encoded frame on arrival."""
+
+    data: object  #: input for the vehicle's decoder
+    is_key: bool  #: whether decoding can start here
+    captured_ns: int  #: capture time, on this host's clock
+    arrived_ns: int
+    connection: int  #: increases with each connection; frames never refer to those of another connection
+
+
+class FrameBacklog:
+    """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest wins.
+
+    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, frames
+    before the newest key frame are dropped; the rest must all be decoded, as each refers to the previous one, but only
+    the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
+    subscriber gets an image at once.
+
+    ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
+    """
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        self._frames: deque[tuple[Coded, bool]] = deque()  # frames, and whether each was wanted on arrival
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def put(self, frame: Coded, *, wanted: bool) -> None:
+        """Add a received frame."""
+        if frame.is_key and not wanted:
+            self._drop(len(self._frames))
+        elif len(self._frames) == MAX_FRAMES:
+            self._drop(1)  # frames that refer to it are lost up to the next key frame, as after any loss
+        self._frames.append((frame, wanted))
+
+    def take(self, now_ns: int) -> tuple[Coded, bool]:
+        """Remove the frame to decode next; return it and whether to show it. Raises ``IndexError`` if there is none."""
+        if self._late(now_ns):
+            keys = [n for n, (frame, _) in enumerate(self._frames) if frame.is_key]
+            self._drop(keys[-1] if keys else 0)
+        show = len(self._frames) == 1 or not self._late(now_ns)
+        frame, wanted = self._frames.popleft()
+        self.skipped += wanted and not show
+        return frame, show
+
+    def _late(self, now_ns: int) -> bool:
+        return now_ns - self._frames[0][0].arrived_ns > LATE_NS
+
+    def _drop(self, count: int) -> None:
+        for _ in range(count):
+            _, wanted = self._frames.popleft()
+            self.skipped += wanted
 
 
 class Decoded(NamedTuple):
@@ -47,12 +105,9 @@ class Stream(Protocol):
         """Number of bytes outside whole frames."""
 
     def read(self) -> list[Coded]:
-        """Return the received frames.
+        """Return the received frames. Raises ``OSError`` if the connection is lost.
 
         Should return within a tenth of a second: :meth:`LiveVideo.stop` waits for it.
-
-        Raises:
-            OSError: The connection is lost.
         """
 
     def close(self) -> None: ...
@@ -73,17 +128,9 @@ class Decoder(Protocol):
         """Forget the stream so far, which the next frame does not continue."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame. Whatever it contains, no other errors are raised.
+        """Decode a frame; return its picture, or None if there is none or it is not wanted (``show``).
 
-        Args:
-            coded: The frame.
-            show: Whether its picture is wanted.
-
-        Returns:
-            The picture; None if there is none or it is not wanted.
-
-        Raises:
-            UnsupportedError: The codec is not supported.
+        Raises :class:`UnsupportedError` for an unsupported codec, and nothing else, whatever the frame contains.
         """
 
 
@@ -138,11 +185,7 @@ class VideoCounters:
     reconnects: int = 0  #: connections that delivered frames, not counting the first
 
     def telemetry(self, of: str) -> dict[str, Value]:
-        """Return the counters for feedback's ``native``.
-
-        Args:
-            of: Prefix of the names, followed by a dot.
-        """
+        """Return the counters for feedback's ``native``; ``of`` is the prefix of their names, without the dot."""
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
 

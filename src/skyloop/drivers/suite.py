@@ -65,29 +65,13 @@ class DriverSuite:
     For a vehicle that is slower or moves less, override the class attributes below; override :meth:`vehicle_disappears`
     and :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a
     fixture and override :meth:`new_driver`.
-
-    Attributes:
-        uri: Address of the vehicle to test with.
-        connect_timeout_s: How long the link may take to come up [s]. Other names in ``_timeout_s`` are limits, too.
-        close_grace_s: How long joined threads may take to vanish from the system's tables [s].
-        speed: Commanded speed forward, backward, left and right [m/s].
-        climb: Commanded speed up and down [m/s].
-        tilt: Commanded roll and pitch, for a vehicle that does not support velocities [rad].
-        yaw_rate: Commanded yaw rate [rad/s].
-        distance: How far the vehicle must move in each direction within ``motion_timeout_s`` [m].
-        turn: How far the vehicle must turn [rad].
-        near: How close the vehicle must get to a commanded position [m].
-        stand_s: How long the suite watches a vehicle that must not start its motors [s].
-        feedback_age_s: Maximum age of a sample on arrival [s].
-        frame_age_s: Maximum age of a frame on arrival [s].
-        untouched_parameters: Names of parameters that the suite must not write.
     """
 
-    #: Address of the vehicle to test with.
-    uri: ClassVar[str] = ""
+    uri: ClassVar[str] = ""  #: address of the vehicle to test with
 
-    #: Time limits [s].
-    connect_timeout_s: ClassVar[float] = 5.0
+    connect_timeout_s: ClassVar[float] = (
+        5.0  #: how long the link may take to come up [s]; others are limits too
+    )
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
     takeoff_timeout_s: ClassVar[float] = 15.0
@@ -95,27 +79,19 @@ class DriverSuite:
     motion_timeout_s: ClassVar[float] = 6.0
     emergency_timeout_s: ClassVar[float] = 3.0
     lost_timeout_s: ClassVar[float] = 5.0
-    close_grace_s: ClassVar[float] = 2.0  #: time for joined threads to vanish from the system's tables
+    close_grace_s: ClassVar[float] = 2.0  #: time for joined threads to vanish from the system's tables [s]
 
-    #: Commands in the flight test: speed and climb [m/s], tilt [rad], yaw rate [rad/s]. How far the vehicle must move
-    #: (distance [m]) and turn [rad], and how close it must get to a commanded position (near [m]).
-    speed: ClassVar[float] = 0.4
-    climb: ClassVar[float] = 0.4
-    tilt: ClassVar[float] = 0.08
-    yaw_rate: ClassVar[float] = 0.6
-    distance: ClassVar[float] = 0.15
-    turn: ClassVar[float] = 0.2
-    near: ClassVar[float] = 0.15
-
-    #: How long the suite watches a vehicle that must not start its motors [s].
-    stand_s: ClassVar[float] = 2.0
-
-    #: How old a sample or frame may be on arrival [s].
-    feedback_age_s: ClassVar[float] = 0.5
-    frame_age_s: ClassVar[float] = 1.0
-
-    #: Parameters that the suite must not write.
-    untouched_parameters: ClassVar[frozenset[str]] = frozenset()
+    speed: ClassVar[float] = 0.4  #: commanded speed forward, backward, left and right [m/s]
+    climb: ClassVar[float] = 0.4  #: commanded speed up and down [m/s]
+    tilt: ClassVar[float] = 0.08  #: commanded roll and pitch, for a vehicle that does not support velocities [rad]
+    yaw_rate: ClassVar[float] = 0.6  #: commanded yaw rate [rad/s]
+    distance: ClassVar[float] = 0.15  #: how far the vehicle must move in each direction within ``motion_timeout_s`` [m]
+    turn: ClassVar[float] = 0.2  #: how far the vehicle must turn [rad]
+    near: ClassVar[float] = 0.15  #: how close the vehicle must get to a commanded position [m]
+    stand_s: ClassVar[float] = 2.0  #: how long the suite watches a vehicle that must not start its motors [s]
+    feedback_age_s: ClassVar[float] = 0.5  #: maximum age of a sample on arrival [s]
+    frame_age_s: ClassVar[float] = 1.0  #: maximum age of a frame on arrival [s]
+    untouched_parameters: ClassVar[frozenset[str]] = frozenset()  #: names of parameters that the suite must not write
 
     # To be implemented or overridden by a driver's test ------------------------------------------------------
 

@@ -6,6 +6,7 @@ import math
 import time
 import unittest
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from skyloop.drivers.base import Driver
@@ -25,17 +26,11 @@ Measure = Callable[[Feedback, Feedback], float | None]
 class Flight:
     """One flight in the suite, with the vehicle's own take-off and landing if it has them, otherwise by set-points.
 
-    Args:
-        suite: Provides speeds, distances and time-outs.
-        driver: An open driver with its link up.
-        sink: The driver's sink.
-
-    Raises:
-        unittest.SkipTest: The vehicle supports neither velocity nor attitude set-points.
-        AssertionError: No feedback arrives.
+    Speeds, distances and time-outs are the suite's. Whatever does not happen in time raises ``AssertionError``.
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
+        """Begin with an open driver whose link is up; skip the test if it supports no set-points."""
         self.suite = suite
         self.driver = driver
         self.sink = sink
@@ -45,19 +40,7 @@ class Flight:
         suite.wait_for_feedback(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
-        """Wait until the newest feedback meets a condition.
-
-        Args:
-            condition: Called with the newest feedback after each of the driver's calls.
-            timeout_s: How long to wait [s].
-            what: Completes "not ... within" in the error.
-
-        Returns:
-            The newest feedback.
-
-        Raises:
-            AssertionError: The condition was not met in time.
-        """
+        """Wait until the newest feedback meets a condition, and return it; the error says "not ``what`` within"."""
         sink = self.sink
 
         def holds() -> bool:
@@ -68,20 +51,12 @@ class Flight:
         return sink.newest
 
     def wake(self) -> None:
-        """Wait until the vehicle has started up, if its link reports that it is starting.
-
-        Raises:
-            AssertionError: The vehicle had not started up within the suite's ``takeoff_timeout_s``.
-        """
+        """Wait until the vehicle has started up, if its link reports that it is starting."""
         links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
         assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
 
     def take_off(self) -> None:
-        """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
-
-        Raises:
-            AssertionError: The vehicle had not started up, or not taken off, within the suite's ``takeoff_timeout_s``.
-        """
+        """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m."""
         if "takeoff" in self.actions:
             self.wake()
             self.driver.apply(Takeoff())
@@ -94,11 +69,7 @@ class Flight:
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait; a vehicle without its own landing descends until it is landed or below 0.1 m.
-
-        Raises:
-            AssertionError: The vehicle had not landed within the suite's ``land_timeout_s``.
-        """
+        """Land and wait; a vehicle without its own landing descends until it is landed or below 0.1 m."""
         if "land" in self.actions:
             self.driver.apply(Land())
             self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
@@ -112,15 +83,10 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Apply a velocity if the vehicle supports it, otherwise the attitude that accelerates that way.
+        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude that goes there.
 
-        It is sent only once, because the driver must keep it in force.
-
-        Args:
-            forward: In body axes [m/s]; for an attitude only the sign counts, and the angle is the suite's ``tilt``.
-            left: Like ``forward``.
-            up: Vertical velocity [m/s].
-            turn: Yaw rate [rad/s], positive counter-clockwise seen from above.
+        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. It is
+        sent only once, because the driver must keep it in force.
         """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
@@ -130,24 +96,16 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move in both directions along each axis, which is needed to check the sign.
-
-        Raises:
-            AssertionError: The vehicle did not move the suite's ``distance`` or ``turn`` within ``motion_timeout_s``.
-        """
+        """Move in both directions along each axis, which is needed to check the sign."""
         suite = self.suite
         for sign in (1.0, -1.0):
             self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
             self._goes("yaw", _turned, sign * suite.turn, turn=sign * suite.yaw_rate)
-            self._goes("forward", _ahead, sign * suite.distance, forward=sign * suite.speed)
-            self._goes("left", _aside, sign * suite.distance, left=sign * suite.speed)
+            self._goes("forward", partial(_along, axis=0), sign * suite.distance, forward=sign * suite.speed)
+            self._goes("left", partial(_along, axis=1), sign * suite.distance, left=sign * suite.speed)
 
     def goes_to_places(self) -> None:
-        """If the vehicle supports positions, fly to one to the side and above, turn, and fly back.
-
-        Raises:
-            AssertionError: The vehicle had not arrived, or not turned, within the suite's ``motion_timeout_s``.
-        """
+        """Fly to a position to the side and above, turn, and fly back."""
         suite, start = self.suite, self.sink.newest
         assert start is not None
         assert start.position_m is not None, "a vehicle that supports positions must report its own"
@@ -208,14 +166,6 @@ def _turned(start: Feedback, now: Feedback) -> float | None:
     if start.yaw_rad is None or now.yaw_rad is None:
         return None
     return wrap_angle(now.yaw_rad - start.yaw_rad)
-
-
-def _ahead(start: Feedback, now: Feedback) -> float | None:
-    return _along(start, now, 0)
-
-
-def _aside(start: Feedback, now: Feedback) -> float | None:
-    return _along(start, now, 1)
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
