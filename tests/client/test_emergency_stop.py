@@ -12,7 +12,7 @@ from skyloop.client import actions
 from skyloop.client.actions import CommandSchedule
 from skyloop.client.drone import Drone
 from skyloop.clock import NS_PER_S, ManualClock
-from skyloop.drivers.motor_stop import GIVE_UP_NS
+from skyloop.drivers.vehicle_session import GIVE_UP_NS
 from skyloop.errors import RefusedError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,

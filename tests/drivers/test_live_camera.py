@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyloop.drivers.camera_options import source_of
 from skyloop.drivers.h264 import PPS, SPS, START, unit_type, units
-from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
+from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings, source_of
 from skyloop.drivers.recording_sink import RecordingSink, SeenPicture
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Intrinsics

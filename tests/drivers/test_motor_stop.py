@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.motor_stop import GIVE_UP_NS, PACE_NS, SETTLE_NS, MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent
+from skyloop.drivers.vehicle_session import GIVE_UP_NS, PACE_NS, SETTLE_NS, MotorStop, VehicleEvent
 from skyloop.errors import DriverError
 
 TICK_NS = nanoseconds(0.02)

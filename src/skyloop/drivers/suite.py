@@ -69,9 +69,7 @@ class DriverSuite:
 
     uri: ClassVar[str] = ""  #: address of the vehicle to test with
 
-    connect_timeout_s: ClassVar[float] = (
-        5.0  #: how long the link may take to come up [s]; others are limits too
-    )
+    connect_timeout_s: ClassVar[float] = 5.0  #: how long the link may take to come up [s]; others are limits too
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
     takeoff_timeout_s: ClassVar[float] = 15.0

@@ -12,8 +12,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import KEPT_NS, VehicleEvent
+from skyloop.drivers.vehicle_session import KEPT_NS, MotorStop, VehicleEvent
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -118,8 +117,8 @@ class SetpointController:
     ) -> AnyAction:
         """Accept an action.
 
-        While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`), a take-off is refused
-        and all other actions are ignored.
+        While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused and all other actions are
+        ignored.
 
         Args:
             action: The requested action.
