@@ -79,12 +79,9 @@ class ChildProcess:
     ) -> None:
         """Start the child.
 
-        Args:
-            command: Command line of the child.
-            keep_errors: Whether to keep its standard error for :attr:`last_words`; if False, the child shares this
-                process's standard error.
-            inherited: File descriptors that the child inherits.
-            handed: Data for :func:`handed_over` that must not be on a command line, which all users can read.
+        ``keep_errors``: whether to keep its standard error for :attr:`last_words`; if False, it shares this process's.
+        ``inherited``: file descriptors that it inherits. ``handed``: data for :func:`handed_over` that must not be on a
+        command line, which all users can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
@@ -235,7 +232,7 @@ class RestartingChild:
         keep_errors: bool = False,
         handed: str | None = None,
     ) -> None:
-        """Prepare; :meth:`start` starts the first child.
+        """Prepare; :meth:`start` starts the first child. For what is not listed, see :class:`ChildProcess`.
 
         Args:
             command: The children's command line.
@@ -245,8 +242,8 @@ class RestartingChild:
                 Returns the pause before the next start [s]; None for no restart.
             started: Called with each child, under the lock, before its output is read; must be quick.
             silent: Returns whether the current child hangs and must be killed; called four times a second.
-            keep_errors: See :class:`ChildProcess`.
-            handed: See :class:`ChildProcess`.
+            keep_errors: As for a child.
+            handed: As for a child.
         """
         self._command = command
         self._read = read
@@ -274,11 +271,7 @@ class RestartingChild:
         return not self._keeper.is_alive()
 
     def start(self) -> None:
-        """Start the first child. Call it only once.
-
-        Raises:
-            OSError: The child can't be started.
-        """
+        """Start the first child, once. Raises ``OSError`` if it can't be started."""
         self._begin()
         self._keeper.start()
 
@@ -352,9 +345,7 @@ class RestartingChild:
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
-    Args:
-        stop: Ends the child.
-        descriptor: The pipe's reading end; standard input in a :class:`ChildProcess`.
+    ``descriptor`` is the pipe's reading end; standard input in a :class:`ChildProcess`.
     """
 
     def watch() -> None:

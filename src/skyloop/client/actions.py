@@ -125,15 +125,9 @@ def in_world_axes(
 ) -> tuple[object, object, object]:
     """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
 
-    Args:
-        local: x, y, z in world axes [m].
-        earth: Latitude and longitude [°], and altitude above mean sea level [m]; None: the current height.
-        newest: The newest feedback.
-        age_s: Its age [s].
-
-    Raises:
-        UsageError: If both forms or neither are given, or a value is not a number or not on the earth.
-        RefusedError: If the vehicle's geographic position is unknown.
+    ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m],
+    None for the current height. Raises :class:`UsageError` if both forms or neither are given, or a value is not a
+    number or not on the earth, and :class:`RefusedError` if the vehicle's geographic position is unknown.
     """
     if all(one is None for one in earth):
         if any(one is None for one in local):

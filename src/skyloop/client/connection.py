@@ -178,10 +178,8 @@ class ProxyConnection:
     ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
-        Args:
-            body: Called for each attempt; returns the request.
-            timeout_s: Total time [s].
-            may_repeat: Whether to repeat the request if the link breaks between sending it and receiving the answer.
+        ``body`` returns the request, for each attempt, ``may_repeat`` whether to repeat it if the link breaks between
+        sending it and receiving the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
@@ -279,10 +277,8 @@ class ConnectionSupervisor:
     def start(self, timeout_s: float = 5.0) -> None:
         """Connect for the first time, within ``timeout_s``, and stay connected from then on.
 
-        Raises:
-            NoAnswerError: If the proxy does not answer Hello.
-            RefusedError: If the proxy refuses the connection.
-            SkyloopError: Any other error of the dialer.
+        Raises :class:`NoAnswerError` if the proxy does not answer Hello, :class:`RefusedError` if it refuses the
+        connection, and the dialer's errors.
         """
         deadline = time.monotonic() + timeout_s
         ended = False

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Literal, ParamSpec, Self, TypedDict, TypeVar, Unpack
 
 import msgspec
@@ -1259,9 +1258,7 @@ class Drone:
         self._connection.check_open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         problem = self._piloting.end_flight()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)

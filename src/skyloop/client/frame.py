@@ -199,12 +199,7 @@ class Arrival:
             return self._pixels
 
     def frame(self) -> Frame:
-        """Return the frame, decoded on the first call.
-
-        Raises:
-            DecodeError: If the pixels do not match the header.
-            MissingExtraError: If it is a JPEG and OpenCV is not installed.
-        """
+        """Return the frame, decoded on the first call. Raises the errors of :func:`to_bgr`."""
         with self._lock:
             frame = self._frame() if self._frame is not None else None
             if frame is None:
@@ -275,9 +270,7 @@ class SmallArrival(Arrival):
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
     """Return a frame as a JPEG, to store many of them; :meth:`Arrival.frame` decodes it.
 
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-        LinkError: OpenCV could not encode it as JPEG.
+    Raises :class:`MissingExtraError` without OpenCV, and :class:`LinkError` if that could not encode it.
     """
     from_ = frame._arrival
     plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
@@ -299,9 +292,8 @@ def size_error(header: FrameHeader, size: int) -> str:
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
     """Convert a frame's bytes to BGR, shape (height, width, 3), uint8, without a copy if they are BGR.
 
-    Raises:
-        DecodeError: If the pixels are not a JPEG of the size in the header.
-        MissingExtraError: If they are a JPEG and OpenCV is not installed.
+    Raises :class:`DecodeError` if they are not a JPEG of the size in the header, and :class:`MissingExtraError` if they
+    are one and OpenCV is not installed.
     """
     height, width = header.height, header.width
     encoding = header.encoding
@@ -343,15 +335,10 @@ class FeedbackHistory:
         samples.append(sample)
 
     def at(self, captured_ns: int) -> tuple[Feedback | None, float | None, bool]:
-        """Return the state at a time on the proxy's clock.
+        """Return the state at a time on the proxy's clock, its reach [s], and whether there was a sample on each side.
 
-        Args:
-            captured_ns: Time on the proxy's clock [ns].
-
-        Returns:
-            The state, its reach [s], and whether there was a sample on each side. The reach is the time to the more
-            distant sample used. With samples on one side only, the state is the nearest sample unchanged; with none,
-            state and reach are None.
+        The reach is the time to the more distant sample used. With samples on one side only, the state is the nearest
+        sample unchanged; with none, state and reach are None.
         """
         samples = list(self._samples)
         if not samples:
@@ -368,14 +355,9 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Interpolate the state linearly between two samples, with angles along the shorter way.
+    """Interpolate the state at a time between two samples linearly, with angles along the shorter way.
 
     Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
-
-    Args:
-        a: The earlier sample.
-        b: The later sample.
-        captured_ns: A time between them.
     """
     share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
     nearer = a if share < 0.5 else b

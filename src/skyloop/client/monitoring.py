@@ -233,28 +233,18 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class ChannelStats:
-    """Statistics of one channel since the drone was connected. Unknown values are None.
+    """Statistics of one channel since the drone was connected. Unknown values are None."""
 
-    Attributes:
-        count: Samples received; for commands, commands sent.
-        rate_hz: Samples per second, over the last two seconds.
-        lost: Samples missing, judged by gaps in their numbers; for video including those that the proxy left out.
-        dropped: Samples replaced by newer ones before their consumer took them; for commands, those that the transport
-            did not accept.
-        malformed: Undecodable samples.
-        delay_s: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
-        age_s: Time since the newest sample's capture.
-        uncertainty_s: Maximum error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
-    """
-
-    count: int = 0
-    rate_hz: float = 0.0
-    lost: int = 0
+    count: int = 0  #: samples received; for commands, commands sent
+    rate_hz: float = 0.0  #: samples per second, over the last two seconds
+    lost: int = 0  #: missing, judged by gaps in their numbers; for video including those that the proxy left out
+    #: Replaced by newer ones before their consumer took them; for commands, those that the transport did not accept.
     dropped: int = 0
-    malformed: int = 0
+    malformed: int = 0  #: undecodable samples
+    #: From publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
     delay_s: Distribution | None = None
-    age_s: float | None = None
-    uncertainty_s: float = 0.0
+    age_s: float | None = None  #: time since the newest sample's capture
+    uncertainty_s: float = 0.0  #: maximum error of both from comparing two hosts' clocks; 0 on one host
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:

@@ -280,11 +280,7 @@ class ActionWait:
         return commands.intent != self._intent and not behind
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
-        """Wait until the action is done.
-
-        Args:
-            timeout_s: The caller's time-out [s], for the error.
-            deadline_s: The deadline, on ``time.monotonic``.
+        """Wait until the action is done, until ``deadline_s`` on ``time.monotonic``; errors name ``timeout_s``.
 
         Raises:
             NoAnswerError: If it is not done in time.

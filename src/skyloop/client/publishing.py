@@ -167,10 +167,9 @@ class Membership:
     def start(self, timeout_s: float) -> None:
         """Join, and renew the membership from then on in a separate thread.
 
-        Raises:
-            NameTakenError: If another application runs other code under this name.
-            RefusedError: If the proxy refuses for another reason.
-            LinkError: If the proxy does not answer within ``timeout_s``, or the drone is closed.
+        Raises :class:`NameTakenError` if another application runs other code under this name, :class:`RefusedError` if
+        the proxy refuses for another reason, and :class:`LinkError` if it does not answer in time or the drone is
+        closed.
         """
         self._state.on_share.add(self._take_share, lambda: 0)
         self._state.on_welcome.add(self._take_welcome, lambda: 0)

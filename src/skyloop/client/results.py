@@ -270,9 +270,7 @@ class ResultChannels:
     def channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, even if no such processor runs.
 
-        Raises:
-            UsageError: If ``processor`` is not a valid name.
-            ClosedError: If the drone was closed.
+        Raises :class:`UsageError` for an invalid name, and :class:`ClosedError` if the drone was closed.
         """
         self._connection.check_open()
         return self._made(checked_name(processor))

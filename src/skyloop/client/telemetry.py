@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
-from types import TracebackType
 from typing import Any, Final, Protocol, Self, TypeVar
 
 from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
@@ -106,9 +105,7 @@ class Mailboxes:
             fill(channel.into(self.results))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._filling.close()
 
     @property
@@ -431,11 +428,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition, and its human-readable name.
-
-    Raises:
-        UnknownNameError: If there is no flight state of this name.
-    """
+    """Return the predicate for a condition and its readable name; :class:`UnknownNameError` for an unknown state."""
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")
         return wanted, "as wanted" if name == "<lambda>" else name

@@ -304,14 +304,8 @@ class VideoChannels:
     ) -> VideoChannel:
         """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
-        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
-
-        Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for another encoding than JPEG.
-            MissingExtraError: If H.264 is requested and PyAV is not installed.
-            ClosedError: If the drone was closed.
+        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`. Raises also
+        :class:`MissingExtraError` if H.264 is requested and PyAV is not installed.
         """
         self._connection.check_open()
         checked_age(max_age_s)

@@ -42,11 +42,8 @@ class Readable(Protocol):
 class NameLookup:
     """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
 
-    It handles one host at a time. Not thread-safe.
-
-    Args:
-        family: Address family of the result.
-        wait_s: How long :meth:`address` may block [s]; 0 on a thread that also serves others.
+    It handles one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
+    that also serves others.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
@@ -199,8 +196,7 @@ class VehicleLink(ABC, Generic[S]):
     def _open_sockets(self) -> None:
         """Replace the sockets with new ones. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: They can't be opened; the link retries.
+        Raises ``OSError`` if they can't be opened; the link retries.
         """
 
     @abstractmethod
@@ -358,16 +354,14 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
     def _connect(self) -> C:
         """Open a connection. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: It can't be opened; the link retries.
+        Raises ``OSError`` if it can't be opened; the link retries.
         """
 
     @abstractmethod
     def _read(self, connection: C) -> None:
         """Pass received data to the session. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: The connection has ended.
+        Raises ``OSError`` if the connection has ended.
         """
 
     def _on_end(self, connection: C) -> None:

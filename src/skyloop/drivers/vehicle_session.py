@@ -74,9 +74,8 @@ RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first an
 class RestartWatch:
     """Distinguishes a restart of the vehicle from late packets, by the packets' increasing numbers. Pure.
 
-    Args:
-        tolerance: Packets whose numbers lag by no more than this are accepted.
-        wrap: Where numbers wrap around to 0; 0: never.
+    Packets whose numbers lag by no more than ``tolerance`` are accepted. Numbers wrap around to 0 at ``wrap``; 0:
+    never.
     """
 
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
@@ -184,9 +183,7 @@ class VehicleSession(ABC):
     def _describe_silence(self, since: str, why: str) -> str:
         """Return the text to show while nothing is received.
 
-        Args:
-            since: The duration, as a phrase that starts with a space; may be empty.
-            why: The host's reason, as a phrase that starts with a space; may be empty.
+        ``since`` (the duration) and ``why`` (the host's reason) are phrases that start with a space; both may be empty.
         """
 
     def _advice(self) -> str:

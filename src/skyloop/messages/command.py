@@ -284,17 +284,10 @@ def check_pose(
     position_std_m: float | None = None,
     attitude_std_rad: float | None = None,
 ) -> None:
-    """Check the numbers of a pose.
+    """Check the numbers of a pose: x, y, z [m]; x, y, z, w; standard deviations [m, rad], None if unknown.
 
-    Args:
-        position: x, y, z [m].
-        quaternion: x, y, z, w.
-        position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
-        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
-
-    Raises:
-        UsageError: If a number is missing or not finite, a standard deviation is negative, or the quaternion's length
-            differs from 1 by more than 0.001.
+    Raises :class:`UsageError` if a number is missing or not finite, a standard deviation is negative, or the
+    quaternion's length differs from 1 by more than 0.001.
     """
     for name, axes, values in (("position", "x, y, z", position), ("quaternion", "x, y, z, w", quaternion)):
         count = len(axes.split(", "))

@@ -245,12 +245,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as from a real vehicle, for benchmarks.
-
-    Args:
-        captured_ns: Time of capture [ns].
-        state: The flight state.
-    """
+    """Return feedback with as many values as from a real vehicle, for benchmarks."""
     return Feedback(
         captured_ns=captured_ns,
         state=state,
