@@ -11,7 +11,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Itera
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from functools import wraps
-from types import TracebackType
 from typing import Any, Generic, TypeVar, Unpack
 
 from skyloop import client
@@ -449,11 +448,9 @@ class Opening(Generic[Opened]):
         self._opened = await self._connect()
         return self._opened
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *error: object) -> None:
         if self._opened is not None:
-            await self._opened.__aexit__(kind, error, traceback)
+            await self._opened.__aexit__(*error)
 
 
 def _reject_in_step(target: object) -> None:

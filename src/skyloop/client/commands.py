@@ -271,7 +271,7 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
-            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within keep_s.
+            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within 0.5 s.
             absent = self._present_until_ns is not None and now_ns > self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:

@@ -235,19 +235,9 @@ class Drone:
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
-        Args:
-            timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
-                start up [s].
-            authority: How a pilot requests the authority; None: ``Authority()``.
-            acquire: Whether to request the authority now; if False, the pilot does so later.
-            wait_for_state: Whether to wait for feedback.
-            wake_s: Time for the vehicle to start up once it may be commanded, if that is longer [s].
-
-        Raises:
-            NoAnswerError: If no answer or no feedback arrives in time.
-            RefusedError: If the proxy refuses the connection.
-            AuthorityError: If the authority is not granted.
-            LinkError: If the proxy can't be reached.
+        ``timeout_s`` is for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to start
+        up, for which it has ``wake_s`` once it may be commanded, if that is longer. With ``acquire=False``, a pilot
+        requests the authority later. Errors are those of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -354,7 +344,7 @@ class Drone:
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
         if found["command"].delay_s is None and self._connection.connected and not self._connection.receiving:
-            found["command"] = _with_delay(found["command"], self._proxy_statistics())
+            found["command"] = replace(found["command"], delay_s=_delay(self._proxy_statistics()))
         return found
 
     def recent_events(self) -> list[Event]:
@@ -1306,17 +1296,9 @@ def open_drone(
     authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
-    """Connect through a dialer; applications call :func:`skyloop.connect`.
+    """Connect through a dialer, now and again after each loss; applications call :func:`skyloop.connect`.
 
-    Args:
-        dial: Connects to the proxy, first now and again after each loss.
-        app: Name of this application, 1 to 64 characters.
-        timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to start up [s].
-        authority: As for :func:`skyloop.connect`.
-        **options: See :class:`DroneOptions`.
-
-    Raises:
-        SkyloopError: The same as for :func:`skyloop.connect`.
+    ``app`` is the application's name, 1 to 64 characters; for the others, see there and :class:`DroneOptions`.
     """
     drone = Drone(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, authority=authority)
@@ -1334,20 +1316,12 @@ def _from_numpy(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
 
 
-def _with_delay(stats: ChannelStats, statistics: Statistics | None) -> ChannelStats:
-    """Return the statistics with the proxy's measured delay from sending to applying."""
+def _delay(statistics: Statistics | None) -> Distribution | None:
+    """Return the proxy's measured delay from sending to applying; None if there is none."""
     counters = {} if statistics is None else statistics.counters
     count = int(counters.get("commands.delay.count", 0))
     if not count:
-        return stats
+        return None
     median = counters.get("commands.delay.median_s", 0.0)
-    return replace(
-        stats,
-        delay_s=Distribution(
-            median=median,
-            p99=counters.get("commands.delay.p99_s", median),
-            maximum=counters.get("commands.delay.max_s", median),
-            mean=counters.get("commands.delay.mean_s", median),
-            count=count,
-        ),
-    )
+    p99, most, mean = (counters.get(f"commands.delay.{name}_s", median) for name in ("p99", "max", "mean"))
+    return Distribution(median, p99, most, mean, count)

@@ -154,6 +154,7 @@ class Arrival:
     __slots__ = (
         "_clock",
         "_frame",
+        "_full",
         "_history",
         "_image",
         "_lock",
@@ -172,12 +173,18 @@ class Arrival:
         offset_ns: int,
         history: FeedbackHistory,
         clock: Clock = time.monotonic_ns,
+        scale: float = 1.0,
     ) -> None:
         """Store a frame received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        ``history`` provides the state at the time of capture.
+        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled
+        down by the factor ``scale`` for width and height when it is decoded.
         """
-        self.header = header
+        self.header = self._full = header
+        if scale != 1.0:
+            small = scaled_header(header, scale)
+            size = small.width * small.height * 3
+            self.header = msgspec.structs.replace(small, encoding=Encoding.BGR8, size=size)
         self.received_ns = received_ns
         self._pixels: Pixels | None = pixels
         self._image: NDArray[np.uint8] | None = None
@@ -194,34 +201,26 @@ class Arrival:
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
     def as_came(self) -> Pixels | None:
-        """Return the bytes as received from the transport, shape (size,); None once the image is decoded."""
+        """Return the bytes as received, shape (size,); None once the image is decoded, or if it is scaled down."""
         with self._lock:
-            return self._pixels
+            return self._pixels if self._full is self.header else None
 
     def frame(self) -> Frame:
         """Return the frame, decoded on the first call. Raises the errors of :func:`to_bgr`."""
         with self._lock:
             frame = self._frame() if self._frame is not None else None
-            if frame is None:
-                frame = self._make()
-                self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
+            if frame is not None:
+                return frame
+            if self._image is None:
+                assert self._pixels is not None
+                image = to_bgr(self._full, self._pixels)
+                self._image = image if self._full is self.header else resized(image, self.header)
+                self._image.flags.writeable = False
+                self._pixels = None
+            frame = self._image.view(Frame)
+            frame._arrival = self
+            self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
             return frame
-
-    def _picture(self) -> NDArray[np.uint8]:
-        """Decode to BGR. Raises :class:`DecodeError`."""
-        assert self._pixels is not None
-        return to_bgr(self.header, self._pixels)
-
-    def _make(self) -> Frame:
-        image = self._image
-        if image is None:
-            image = self._image = self._picture()
-            if image.flags.writeable:
-                image.flags.writeable = False
-            self._pixels = None
-        frame = image.view(Frame)
-        frame._arrival = self
-        return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
         """Return the vehicle's state at the time of capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
@@ -234,37 +233,6 @@ class Arrival:
         if final:
             self._state = feedback, reach_s
         return feedback, reach_s
-
-
-class SmallArrival(Arrival):
-    """A frame received larger than its consumer requested, and scaled down during decoding."""
-
-    __slots__ = ("_full",)
-
-    def __init__(
-        self,
-        header: FrameHeader,
-        pixels: Pixels,
-        received_ns: int,
-        offset_ns: int,
-        history: FeedbackHistory,
-        clock: Clock,
-        scale: float,
-    ) -> None:
-        """Store a frame; ``header`` describes it as received, ``scale`` is the factor for width and height."""
-        small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
-        small = msgspec.structs.replace(small, size=small.width * small.height * 3)
-        super().__init__(small, pixels, received_ns, offset_ns, history, clock)
-        self._full = header
-
-    def as_came(self) -> Pixels | None:
-        """Return None, because the frame was not received in this size."""
-        return None
-
-    def _picture(self) -> NDArray[np.uint8]:
-        assert self._pixels is not None
-        picture: NDArray[np.uint8] = resized(to_bgr(self._full, self._pixels), self.header)
-        return picture
 
 
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
