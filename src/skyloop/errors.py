@@ -101,14 +101,7 @@ class UnknownNameError(UsageError, KeyError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str], *, where: str = "") -> None:
-        """Compose the message, with suggestions from the known names.
-
-        Args:
-            kind: What the name refers to, for example ``camera``.
-            name: The name that was given.
-            known: All known names.
-            where: Where the name was looked up; it follows the name in the message, as in ``on the network``.
-        """
+        """Compose the message, with suggestions; ``where`` follows the name, as in ``on the network``."""
         choices = sorted(set(known))
         self.kind = kind
         self.name = name
@@ -150,25 +143,18 @@ class DecodeError(SkyloopError, ValueError):
 
 
 def install_command(*extras: str) -> str:
-    """Return the command that installs optional parts, both in a checkout and for an installed wheel.
-
-    Args:
-        extras: Names of the optional parts.
-    """
+    """Return the command that installs optional parts, by name, both in a checkout and for an installed wheel."""
     return f"skyloop install {' '.join(extras)}"
 
 
 class MissingExtraError(SkyloopError, ImportError):
-    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``."""
+    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``.
+
+    ``what`` is the feature that needs it, ``cause`` why the import failed, if known.
+    """
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
-        """Compose the message.
-
-        Args:
-            what: The feature that needs the optional part.
-            extra: Name of the extra for ``skyloop install``.
-            cause: Why the import failed, if known.
-        """
+        """Compose the message."""
         self.what = what
         self.extra = extra
         self.cause = cause
@@ -223,13 +209,7 @@ class SwarmError(SkyloopError):
     """
 
     def __init__(self, what: str, errors: Mapping[str, Exception], total: int) -> None:
-        """Compose the message.
-
-        Args:
-            what: Name of the failed action.
-            errors: The exceptions, by name of the drone.
-            total: Number of drones in the swarm.
-        """
+        """Compose the message; ``what`` is the name of the failed action."""
         self.errors = dict(errors)
         self.total = total
         self._what = what

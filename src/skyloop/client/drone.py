@@ -920,11 +920,9 @@ class Drone:
         return self._listen(channel, function, "feedback", inline=inline)
 
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
-        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
+        """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
-        Args:
-            function: Called in its own thread, once a second.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
@@ -943,29 +941,23 @@ class Drone:
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
-        """Call ``function`` with the proxy's echo of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
 
-        Args:
-            function: Called in its own thread; up to 256 echoes wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
-        """Call ``function`` with each application's drawings on frames.
+        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
 
-        Args:
-            function: Called in its own thread; up to 256 drawings wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
 
-        Args:
-            function: Called in its own thread; up to 256 entries wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
 
@@ -1238,8 +1230,8 @@ class Drone:
             deadline_s = time.monotonic() + JOIN_S  # shared by all of them
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
-            for one in list(self._state.to_close):
-                one.close()
+            for close in list(self._state.to_close):
+                close()
             self._state.wake_all()
             if self._on_close is not None:
                 self._on_close()

@@ -173,11 +173,7 @@ class Offset:
     uncertainty_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Trip:
-    sent_ns: int  # on our clock; the drift bounds how much the offset has changed since
-    low_ns: int
-    high_ns: int
+_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: time on our clock, since when the bounds have widened
 
 
 class OffsetEstimator:
@@ -200,7 +196,7 @@ class OffsetEstimator:
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
         """Add a round trip, answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
-        self._trips.append(_Trip(sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
+        self._trips.append((sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
 
     def at(self, now_ns: int) -> Offset:
@@ -216,8 +212,9 @@ class OffsetEstimator:
         return Offset((low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2)
 
     def _bounds(self, trip: _Trip, now_ns: int) -> tuple[int, int]:
-        drift_ns = round(max(0, now_ns - trip.sent_ns) * self._max_drift)
-        return trip.low_ns - drift_ns, trip.high_ns + drift_ns
+        sent_ns, low_ns, high_ns = trip
+        drift_ns = round(max(0, now_ns - sent_ns) * self._max_drift)
+        return low_ns - drift_ns, high_ns + drift_ns
 
 
 @dataclass(frozen=True, slots=True)

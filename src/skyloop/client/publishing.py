@@ -181,7 +181,7 @@ class Membership:
             self._leave()
             raise
         self._thread.start()
-        self._state.to_close.append(self)
+        self._state.to_close.append(self.close)
 
     def renew(self) -> None:
         """Renew at once, for example because :attr:`ready` has changed. Thread-safe."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
@@ -54,12 +54,6 @@ class LinkStatus:
     vehicle: LinkState  #: hop from proxy to vehicle, as last reported by the proxy
     reason: str = ""
     remedy: str = ""  #: what to do about the vehicle's link while it is not up
-
-
-class Closable(Protocol):
-    """A resource that ends with the drone."""
-
-    def close(self) -> None: ...
 
 
 class Mailboxes:
@@ -199,7 +193,7 @@ class ClientState:
         self.app = app
         self.scheduler = scheduler
         self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
-        self.to_close: list[Closable] = []  #: resources that end with the drone
+        self.to_close: list[Callable[[], None]] = []  #: end resources that end with the drone
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback arrived, on our clock
@@ -242,13 +236,13 @@ class ClientState:
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
-    def closing(self, mailbox: Closable) -> Iterator[None]:
+    def closing(self, mailbox: Mailbox[Any] | ResultMailbox) -> Iterator[None]:
         """Close ``mailbox``, which wakes its consumer, if the drone is closed during the block."""
-        self.to_close.append(mailbox)
+        self.to_close.append(mailbox.close)
         try:
             yield
         finally:
-            self.to_close.remove(mailbox)
+            self.to_close.remove(mailbox.close)
 
     def forget(self, listener: Listener[Any]) -> None:
         """Forget a cancelled listener."""

@@ -32,13 +32,9 @@ class VehicleUri:
     __slots__ = ("_given", "_secrets", "options", "place", "scheme")
 
     def __init__(self, scheme: str, place: str = "", options: Mapping[str, str] | None = None, text: str = "") -> None:
-        """Store an address.
+        """Store an address: the driver's name, a host, a path or nothing, and options by name.
 
-        Args:
-            scheme: The driver's name.
-            place: A host, a path, or nothing.
-            options: Options by name.
-            text: The address as given; empty if it is built in code.
+        ``text`` is the address as given; empty if it is built in code.
         """
         given = dict(options or {})
         broken = is_broken(given)
@@ -128,17 +124,7 @@ class VehicleUri:
         return value
 
     def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
-        """Return an option as a whole number within a range.
-
-        Args:
-            option: Name of the option.
-            default: Returned if the option is not given.
-            minimum: Smallest allowed value.
-            maximum: Largest allowed value.
-
-        Raises:
-            UsageError: The option is not a whole number within the range.
-        """
+        """Return an option as a whole number within a range; arguments and errors are those of :meth:`number`."""
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
             raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
@@ -147,12 +133,7 @@ class VehicleUri:
     def flag(self, option: str, default: bool = False) -> bool:
         """Return an option as a bool: ``1``, ``true``, ``yes`` or the bare name; ``0``, ``false`` or ``no``.
 
-        Args:
-            option: Name of the option.
-            default: Returned if the option is not given.
-
-        Raises:
-            UsageError: The option has any other value.
+        Raises :class:`UsageError` for any other value. ``default`` is returned if the option is not given.
         """
         given = self.options.get(option)
         if given is None:
