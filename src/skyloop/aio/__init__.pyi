@@ -104,9 +104,7 @@ class Drone:
     def __init__(self, sync: client.Drone) -> None:
         """Wrap a connected drone."""
     async def __aenter__(self) -> Drone: ...
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def log(self) -> client.Logbook:
@@ -707,13 +705,11 @@ class Drone:
     def on_overview(
         self, function: Callable[[Overview], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
+        """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop, once a second.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop or, with ``inline``, on the receiving one.
         """
     def on_feedback(
         self,
@@ -753,33 +749,27 @@ class Drone:
     def on_command(
         self, function: Callable[[Applied], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with the proxy's echo of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 echoes wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop or, with ``inline``, on the receiving one.
         """
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each application's drawings on frames.
+        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 drawings wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop or, with ``inline``, on the receiving one.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
-        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 entries wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop or, with ``inline``, on the receiving one.
         """
     def on_result(
         self,
@@ -889,10 +879,6 @@ class Swarm:
         Args:
             wait: Wait until each hovers.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land all active drones at their current positions, at the same time; see :meth:`Drone.land`.
@@ -902,10 +888,6 @@ class Swarm:
         Args:
             wait: Wait until each has landed.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def go_to(
         self,
@@ -1059,10 +1041,6 @@ class Swarm:
 
         Args:
             max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.
