@@ -390,9 +390,11 @@ class SessionSamples:
     def _event(self, event: Event, now_ns: int) -> None:
         """Store and publish an event."""
         self._state.recent.append(event)
-        if event.kind is EventKind.PARAMETER_CHANGED and event.data.get("app_id") != self._commands.app_id:
-            self._restorer.overwritten(str(event.data.get("name")))
-        self._commands.event(event, now_ns)
+        if event.kind is EventKind.PARAMETER_CHANGED:
+            if event.data.get("app_id") != self._commands.app_id:
+                self._restorer.overwritten(str(event.data.get("name")))
+        elif event.kind.startswith("authority_"):
+            self._commands.event(event, now_ns)
         self._state.on_event.publish(event)
         self._state.notifier.notify()
 

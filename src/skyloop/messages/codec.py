@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
-from typing import Final
+from typing import Final, get_args
 
 import msgspec
 
@@ -26,15 +26,16 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
 
+#: What a packet can hold, in the order of :class:`Kind`.
 Sample = (
     Command
-    | Applied
     | Feedback
     | FrameHeader
     | Event
     | Request
     | Reply
     | Annotation
+    | Applied
     | LogEntry
     | EncodedFrame
     | ProcessorResult
@@ -65,23 +66,7 @@ class Kind(IntEnum):
     STREAM_REPORT = 15
 
 
-KINDS: Final[dict[type[Sample], Kind]] = {
-    Command: Kind.COMMAND,
-    Feedback: Kind.FEEDBACK,
-    FrameHeader: Kind.FRAME,
-    Event: Kind.EVENT,
-    Request: Kind.REQUEST,
-    Reply: Kind.REPLY,
-    Annotation: Kind.ANNOTATION,
-    Applied: Kind.APPLIED,
-    LogEntry: Kind.LOG,
-    EncodedFrame: Kind.ENCODED,
-    ProcessorResult: Kind.RESULT,
-    ProcessorShare: Kind.SHARE,
-    VehiclePose: Kind.POSE,
-    Overview: Kind.OVERVIEW,
-    StreamReport: Kind.STREAM_REPORT,
-}
+KINDS: Final[dict[type[Sample], Kind]] = dict(zip(get_args(Sample), Kind, strict=True))
 
 _encode_body = msgspec.msgpack.Encoder().encode
 _KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}
