@@ -114,7 +114,7 @@ def test_commands_blocked_by_a_stop_are_reported(proxy: ScriptedProxy, drone: Dr
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
-    proxy.until(lambda: not drone._commands.stopping)
+    proxy.until(lambda: not drone._commands.schedule.stopping)
     assert drone.hover()
 
 

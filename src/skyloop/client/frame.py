@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 else:
     _Base = np.ndarray
 
-_CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
 _PNG_LEVEL: Final = 1  #: fastest compression: notebooks display pictures at once and rarely keep them
 _ATTRIBUTES: Final = frozenset(
@@ -246,15 +245,6 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
     header, jpeg = encode_frame(plain, np.asarray(frame).reshape(-1), request)
     pixels = np.frombuffer(jpeg, np.uint8)
     return Arrival(header, pixels, from_.received_ns, from_._offset_ns, from_._history, from_._clock)
-
-
-def size_error(header: FrameHeader, size: int) -> str:
-    """Return why ``size`` bytes can't be the frame announced by ``header``; empty if they can."""
-    channels = _CHANNELS.get(header.encoding)
-    expected = header.size if channels is None else header.width * header.height * channels
-    if size == expected:
-        return ""
-    return f"frame {header.seq} of {header.camera} has {size} bytes and should have {expected}"
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:

@@ -218,7 +218,7 @@ class Piloting:
     def finish_stop(self) -> None:
         """Wait up to 2 s until the vehicle reports an emergency stop, which would otherwise end with the connection."""
         if self._connection.connected and not self._connection.receiving:
-            self._state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
+            self._state.notifier.wait_for(lambda: not self.commands.schedule.stopping, STOP_S)
 
     def _is_down(self) -> bool:
         newest = self._state.newest

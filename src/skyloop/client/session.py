@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from skyloop.client.frame import size_error
 from skyloop.client.monitoring import LinkMonitor, OffsetEstimator, StallWatch, Thresholds
 from skyloop.clock import Clock, clock_identity, nanoseconds
 from skyloop.errors import DecodeError, LinkError, NoAnswerError
@@ -28,6 +27,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
+from skyloop.messages.fields import CHANNELS
 from skyloop.messages.subscription import PLAIN
 from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
@@ -318,7 +318,8 @@ class ProxySession:
         now_ns = self._clock()
         if self._quiet:
             return
-        if size_error(header, pixels.size):
+        channels = CHANNELS.get(header.encoding)
+        if pixels.size != (header.size if channels is None else header.width * header.height * channels):
             self._malformed()
             return
         self.monitor.received_ns = now_ns

@@ -436,7 +436,7 @@ class Swarm:
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
         # Wait a few milliseconds at most until every drone can send a set-point at once, so that all are sent together.
-        open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
+        open_ns = max((drone._commands.schedule.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 

@@ -26,8 +26,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-
-_CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+from skyloop.messages.fields import CHANNELS
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +214,7 @@ class RecordingSink:
         if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or not pixels.flags.c_contiguous:
             self.problems.append(f"frame of {camera}: pixels must be a C-contiguous array of uint8")
             return empty
-        channels = _CHANNELS.get(encoding)
+        channels = CHANNELS.get(encoding)
         if channels is None:
             if bytes(pixels.reshape(-1)[:2]) != b"\xff\xd8":
                 self.problems.append(f"frame of {camera}: not a JPEG file")

@@ -101,6 +101,9 @@ class Encoding(StrEnum):
     JPEG = "jpeg"  #: one JPEG file
 
 
+CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}  #: bytes per pixel of the raw encodings
+
+
 class Role(StrEnum):
     """The role that an application requests when it connects."""
 
