@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Itera
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from functools import wraps
+from types import TracebackType
 from typing import Any, Generic, TypeVar, Unpack
 
 from skyloop import client
@@ -448,9 +449,11 @@ class Opening(Generic[Opened]):
         self._opened = await self._connect()
         return self._opened
 
-    async def __aexit__(self, *error: object) -> None:
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         if self._opened is not None:
-            await self._opened.__aexit__(*error)
+            await self._opened.__aexit__(kind, error, traceback)
 
 
 def _reject_in_step(target: object) -> None:

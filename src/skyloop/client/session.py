@@ -318,8 +318,7 @@ class ProxySession:
         now_ns = self._clock()
         if self._quiet:
             return
-        channels = CHANNELS.get(header.encoding)
-        if pixels.size != (header.size if channels is None else header.width * header.height * channels):
+        if pixels.size != frame_size(header):
             self._malformed()
             return
         self.monitor.received_ns = now_ns
@@ -338,6 +337,12 @@ class ProxySession:
     def _malformed(self) -> None:
         self.monitor.malformed()
         self._poke()
+
+
+def frame_size(header: FrameHeader) -> int:
+    """Return how many bytes the frame announced by ``header`` must have."""
+    channels = CHANNELS.get(header.encoding)
+    return header.size if channels is None else header.width * header.height * channels
 
 
 def _carrier(topic: str, *, variants: bool) -> str:
