@@ -120,10 +120,7 @@ def return_action(height_m: object, land: object) -> ReturnToStart:
 
 
 def in_world_axes(
-    local: tuple[object, object, object],
-    earth: tuple[object, object, object],
-    newest: Feedback | None,
-    age_s: float,
+    local: tuple[object, object, object], earth: tuple[object, object, object], newest: Feedback | None, age_s: float
 ) -> tuple[object, object, object]:
     """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
 

@@ -12,15 +12,7 @@ from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.monitoring import ChannelCounter
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    Hint,
-    LinkError,
-    NoAnswerError,
-    RefusedError,
-    UnsupportedError,
-)
+from skyloop.errors import AuthorityError, ClosedError, Hint, LinkError, NoAnswerError, RefusedError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,

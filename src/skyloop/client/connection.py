@@ -17,14 +17,7 @@ from skyloop.client.monitoring import Thresholds
 from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
-from skyloop.messages import (
-    AnyReply,
-    AnyRequest,
-    Hello,
-    LinkState,
-    Refused,
-    Welcome,
-)
+from skyloop.messages import AnyReply, AnyRequest, Hello, LinkState, Refused, Welcome
 from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
@@ -170,11 +163,7 @@ class ProxyConnection:
             session.requests.ask(body, done, timeout_s, self._clock())
 
     def call(
-        self,
-        body: Callable[[], AnyRequest],
-        timeout_s: float = 2.0,
-        *,
-        may_repeat: Callable[[], bool] = lambda: True,
+        self, body: Callable[[], AnyRequest], timeout_s: float = 2.0, *, may_repeat: Callable[[], bool] = lambda: True
     ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 

@@ -48,14 +48,7 @@ from skyloop.client.publishing import Logbook, checked_time
 from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
 from skyloop.client.telemetry import ClientState, LinkStatus, SessionSamples, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    LinkError,
-    NoAnswerError,
-    UnknownNameError,
-    UsageError,
-)
+from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
     AnyAction,
@@ -579,12 +572,7 @@ class Drone:
         self._piloting.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 
     def return_to_start(
-        self,
-        height_m: float | None = None,
-        *,
-        land: bool | None = None,
-        wait: bool = True,
-        timeout_s: float = 180.0,
+        self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
         """Fly back to where the vehicle took off, and land there or hover.
 
@@ -675,12 +663,7 @@ class Drone:
 
     # Reading ---------------------------------------------------------------------------------------------------
 
-    def feedback(
-        self,
-        *,
-        max_age_s: float | None = None,
-        max_hz: float | None = None,
-    ) -> Feedback:
+    def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback.
 
         An observer receives only as much data as its consumers need, and every sample as long as none of them limits
@@ -814,11 +797,7 @@ class Drone:
                 raise self._state.no_frame(channel.camera.name, timeout_s)
 
     def frames(
-        self,
-        camera: str | None = None,
-        *,
-        timeout_s: float = 5.0,
-        **how: Unpack[VideoOptions],
+        self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> Iterator[Frame]:
         """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
@@ -896,11 +875,7 @@ class Drone:
     # Callbacks -------------------------------------------------------------------------------------------------
 
     def on_feedback(
-        self,
-        function: Callable[[Feedback], object],
-        *,
-        inline: bool = False,
-        max_hz: float | None = None,
+        self, function: Callable[[Feedback], object], *, inline: bool = False, max_hz: float | None = None
     ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 

@@ -13,14 +13,7 @@ from skyloop.client.actions import OUTDONE, OVERRULED
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    NoAnswerError,
-    RefusedError,
-    SkyloopError,
-    UnsupportedError,
-)
+from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, SkyloopError, UnsupportedError
 from skyloop.messages import (
     AnyAction,
     EmergencyStop,

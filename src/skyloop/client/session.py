@@ -137,12 +137,7 @@ class ProxySession:
     """
 
     def __init__(
-        self,
-        handler: ConnectionHandler,
-        poke: Callable[[], None],
-        thresholds: Thresholds,
-        clock: Clock,
-        dial: Dialer,
+        self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock, dial: Dialer
     ) -> None:
         """Connect; ``poke`` wakes the supervisor. Raises the dialer's errors."""
         self._handler = handler

@@ -364,12 +364,7 @@ class Swarm:
         self.fail("go_to", errors)
 
     def return_to_start(
-        self,
-        height_m: float | None = None,
-        *,
-        land: bool | None = None,
-        wait: bool = True,
-        timeout_s: float = 180.0,
+        self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
         """Fly all active drones back to where each took off, all at the same time; see :meth:`Drone.return_to_start`.
 

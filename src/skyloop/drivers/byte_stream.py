@@ -42,11 +42,7 @@ class Rank(IntEnum):
 
 
 #: Maximum lag of the line at which packets of a rank are still sent [ns].
-_PATIENCE_NS: Final = {
-    Rank.SETPOINT: nanoseconds(0.1),
-    Rank.QUERY: nanoseconds(0.06),
-    Rank.POSE: nanoseconds(0.02),
-}
+_PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(0.06), Rank.POSE: nanoseconds(0.02)}
 
 
 class LinePace:

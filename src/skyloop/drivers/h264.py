@@ -293,14 +293,7 @@ class StreamRelay:
         self._source = None
 
     def take(
-        self,
-        camera: str,
-        unit: Unit,
-        captured_ns: int,
-        *,
-        number: int,
-        connection: int,
-        picture: bool = True,
+        self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
     ) -> bool:
         """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
 

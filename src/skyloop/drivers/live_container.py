@@ -225,9 +225,7 @@ class LiveDecoder:
     """
 
     def __init__(
-        self,
-        on_whole: Callable[[Coded], None] = lambda _: None,
-        on_forgiving: Callable[[str], None] = lambda _: None,
+        self, on_whole: Callable[[Coded], None] = lambda _: None, on_forgiving: Callable[[str], None] = lambda _: None
     ) -> None:
         self.waited = 0
         self.damaged = 0

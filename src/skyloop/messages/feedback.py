@@ -106,12 +106,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
         return rotation_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
 
-_KEYS: Final = (
-    "origin.latitude_deg",
-    "origin.longitude_deg",
-    "origin.altitude_amsl_m",
-    "origin.radius_m",
-)
+_KEYS: Final = ("origin.latitude_deg", "origin.longitude_deg", "origin.altitude_amsl_m", "origin.radius_m")
 
 
 class EarthOrigin(NamedTuple):
