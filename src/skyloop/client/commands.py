@@ -482,19 +482,12 @@ class CommandSender:
         status = self.status
         if self.role is Role.OBSERVER:
             return AuthorityError(f"{action.name}: this application only observes", code="observer").with_hint(Hint.FLY)
-        if status.state == "preempted":
-            return AuthorityError(
-                f"{action.name}: {status.holder or 'another application'} took over the authority; "
-                "it returns when they release it",
-                code="no_authority",
-            )
-        if status.state == "queued":
-            return AuthorityError(
-                f"{action.name}: {status.holder or 'another application'} holds the authority, and this application "
-                "waits in the queue",
-                code="no_authority",
-            )
-        return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
+        holder = status.holder or "another application"
+        why = {
+            "preempted": f"{holder} took over the authority; it returns when they release it",
+            "queued": f"{holder} holds the authority, and this application waits in the queue",
+        }.get(status.state, "call request_authority() first")
+        return AuthorityError(f"{action.name}: {why}", code="no_authority")
 
     def _not_now(self, action: AnyAction) -> LinkError | AuthorityError:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""

@@ -95,17 +95,13 @@ class LinkMonitor:
         if last is not None:
             if seq <= last:
                 return False
-            if seq != last + 1:
-                self._gap(seq - last - 1, skipped, now_ns)
+            gap = seq - last - 1
+            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy left out as many before each missing one, too
+                self.missing += -((skipped - gap) // (skipped + 1))
         self._last_seq = seq
         self.feedback_ns = now_ns
         self.received += 1
         return True
-
-    def _gap(self, gap: int, skipped: int, now_ns: int) -> None:
-        """Count the samples missing in a gap, given that ``skipped`` are left out before each one."""
-        if gap > skipped and now_ns >= self._no_gaps_ns:
-            self.missing += -((skipped - gap) // (skipped + 1))
 
     def malformed(self) -> None:
         """Record a packet that could not be decoded."""

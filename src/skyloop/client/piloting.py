@@ -49,10 +49,6 @@ _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
 _log = logging.getLogger("skyloop")
 
 
-def _silent(step: str) -> None:
-    """Report nothing."""
-
-
 class Piloting:
     """One application's piloting of its vehicle, up to the end of the flight. Thread-safe."""
 
@@ -160,7 +156,7 @@ class Piloting:
             _log.info("%s: %s, because %s", self._state.name, action.name, reason)
         return sent
 
-    def end_flight(self, report: Callable[[str], object] = _silent) -> SkyloopError | None:
+    def end_flight(self, report: Callable[[str], object] = lambda _: None) -> SkyloopError | None:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
         From the start, commands from the application's other threads raise :class:`ClosedError`; only an emergency stop
@@ -178,7 +174,7 @@ class Piloting:
                 self._close()
 
     def bring_down(
-        self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
+        self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
         """Land and wait for the landing if this application flies the vehicle, or let go; see :meth:`end_flight`."""
         self.finish_stop()

@@ -151,7 +151,7 @@ class Membership:
         self.code = code
         self.shared = shared
         #: Called at each renewal; returns whether this worker can take frames. False gives its share to the others.
-        self.ready: Callable[[], bool] = _always
+        self.ready: Callable[[], bool] = lambda: True
         #: The newest share; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None
         #: Called on the receiving thread when the share has changed.
@@ -253,7 +253,3 @@ def _error(refused: Refused) -> SkyloopError:
     if refused.code is Refusal.NAME_TAKEN:
         return NameTakenError(refused.message)
     return RefusedError(refused.message, code=refused.code.value)
-
-
-def _always() -> bool:
-    return True
