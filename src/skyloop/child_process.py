@@ -232,7 +232,7 @@ class RestartingChild:
         keep_errors: bool = False,
         handed: str | None = None,
     ) -> None:
-        """Prepare; :meth:`start` starts the first child. For what is not listed, see :class:`ChildProcess`.
+        """Prepare; :meth:`start` starts the first child.
 
         Args:
             command: The children's command line.
@@ -242,8 +242,8 @@ class RestartingChild:
                 Returns the pause before the next start [s]; None for no restart.
             started: Called with each child, under the lock, before its output is read; must be quick.
             silent: Returns whether the current child hangs and must be killed; called four times a second.
-            keep_errors: As for a child.
-            handed: As for a child.
+            keep_errors: See :class:`ChildProcess`.
+            handed: See :class:`ChildProcess`.
         """
         self._command = command
         self._read = read

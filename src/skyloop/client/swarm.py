@@ -166,8 +166,8 @@ class Swarm:
     is a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same
     time (or hover, with ``on_exit``), including those set aside, even if some of them fail.
 
-    Commands return a dict with the result of the same command of :class:`Drone` for each name. They and what waits or
-    reads for all raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not
+    Commands return a dict with the result of the same command of :class:`Drone` for each name. Methods that command,
+    read or wait raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not
     finite, and :class:`ClosedError` once the swarm was closed.
     """
 
