@@ -638,9 +638,6 @@ class Drone:
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
@@ -674,9 +671,6 @@ class Drone:
             depth: How many pictures may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
@@ -694,9 +688,6 @@ class Drone:
             function: Called on the event loop. It returns True to hand the authority over, False or a reason (a text)
                 to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
                 after the proxy's ``authority.ask_s``.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called.
@@ -791,9 +782,6 @@ class Drone:
                 listener's ``expired``. None: no limit.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called or another argument is out of range.
