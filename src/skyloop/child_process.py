@@ -62,12 +62,7 @@ if hasattr(os, "register_at_fork"):  # without fork, nothing is inherited
 
 
 class ChildProcess:
-    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread.
-
-    Attributes:
-        pid: Process id of the child.
-        stdout: The child's standard output; open until :meth:`close`.
-    """
+    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread."""
 
     def __init__(
         self,
@@ -101,7 +96,7 @@ class ChildProcess:
             raise
         assert self._process.stdout is not None
         self.pid = self._process.pid
-        self.stdout: IO[bytes] = self._process.stdout
+        self.stdout: IO[bytes] = self._process.stdout  #: open until :meth:`close`
         self._ours = True
         leave_to_parent(self)
 
@@ -214,10 +209,6 @@ class RestartingChild:
     """Keeps one child running, restarting it whenever it ends, until :meth:`stop`. Any thread.
 
     All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and every child is ended.
-
-    Attributes:
-        child: The current or last child; None before the first.
-        restarts: Number of restarts.
     """
 
     def __init__(
@@ -257,7 +248,7 @@ class RestartingChild:
         self._reader: threading.Thread | None = None
         self._name = name
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
-        self.child: ChildProcess | None = None
+        self.child: ChildProcess | None = None  #: the current or last one; None before the first
         self.restarts = 0
 
     @property

@@ -22,11 +22,6 @@ class VehicleUri:
 
     ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles don't contain users, passwords or keys (see
     ``skyloop.address``). Only code that opens the vehicle reads them, with :meth:`reveal_place` and :meth:`reveal`.
-
-    Attributes:
-        scheme: The driver's name.
-        place: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
-        options: Names and values as given, percent-decoded.
     """
 
     __slots__ = ("_given", "_secrets", "options", "place", "scheme")
@@ -38,8 +33,10 @@ class VehicleUri:
         """
         given = dict(options or {})
         broken = is_broken(given)
-        self.scheme: Final = scheme
+        self.scheme: Final = scheme  #: the driver's name
+        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
         self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
+        #: Names and values as given, percent-decoded.
         self.options: Final[Mapping[str, str]] = {
             shown_name(name): without_secrets(value, name, broken=broken) if value else value
             for name, value in given.items()
