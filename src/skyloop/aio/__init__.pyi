@@ -700,7 +700,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving one.
+        It is called on the event loop.
         """
     def on_feedback(
         self,
@@ -744,7 +744,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving one.
+        It is called on the event loop.
         """
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
@@ -753,14 +753,14 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving one.
+        It is called on the event loop.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving one.
+        It is called on the event loop.
         """
     def on_result(
         self,

@@ -153,7 +153,8 @@ def on_loop(member: Any) -> Any:
             raise UsageError(f"{member.__name__}: inline must be False, as the function runs on the event loop")
         return Listener(plain(self, from_thread(function) if callable(function) else function, *args, **given))
 
-    call.__doc__ = (call.__doc__ or "").replace("in its own thread", "on the event loop")
+    where = r"in its own thread( or, with ``inline``, on the receiving one)?"
+    call.__doc__ = re.sub(where, "on the event loop", call.__doc__ or "")
     signature = inspect.signature(member)
     takes = signature.parameters["function"].annotation
     either = re.sub(r"^(Callable\[\[.*\], )(.*)\]$", r"\1\2 | Awaitable[\2]]", takes)
