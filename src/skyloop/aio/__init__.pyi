@@ -47,12 +47,9 @@ class Config:
     def __init__(self, sync: client.Config) -> None:
         """Wrap parameters of a connected drone."""
     async def get(self, name: str) -> Value:
-        """Return the current value.
+        """Return the current value. Raises :class:`UnknownNameError`, with suggestions, for an unknown name.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
-
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
         """
     async def set(self, name: str, value: object) -> None:
         """Write one value.
@@ -86,8 +83,7 @@ class Config:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
+        Raises :class:`UnknownNameError`, with suggestions, if there is no such parameter.
         """
 
 class Drone:

@@ -185,10 +185,8 @@ class CommandSender:
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action``, with numbers already checked, the newest set-point; see :class:`skyloop.Drone`.
 
-        Args:
-            action: The action.
-            now: Raise if it can't be sent at once; in that case only a landing is still sent later.
-            automatic: Whether it is the library's own: never takes a vehicle from others, and passes :meth:`bar`.
+        With ``now``, raise if it can't be sent at once; in that case only a landing is still sent later. ``automatic``:
+        it is the library's own, so it never takes a vehicle from others, and passes :meth:`bar`.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.

@@ -105,11 +105,7 @@ class Frame(_Base):
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
-        """Return a writable plain array with the same pixels, to draw on.
-
-        Args:
-            order: Memory layout, as for :meth:`numpy.ndarray.copy`.
-        """
+        """Return a writable plain array with the same pixels, to draw on; ``order`` as for :func:`numpy.copy`."""
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:

@@ -178,15 +178,10 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """Adopt connected drones, which the swarm closes at its end.
+        """Adopt connected drones, by name, which the swarm closes at its end; see :func:`skyloop.swarm`.
 
-        Args:
-            drones: The drones by name.
-            on_error: What to do when some fail.
-            missing: Requested drones that could not be connected, with the reasons.
-
-        Raises:
-            UsageError: If there is no drone, or ``on_error`` is unknown.
+        ``missing`` are the requested drones that could not be connected, with the reasons. Raises :class:`UsageError`
+        if there is no drone, or ``on_error`` is unknown.
         """
         check_policy(on_error)
         if not drones:

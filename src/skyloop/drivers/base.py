@@ -400,15 +400,7 @@ class Driver(ABC):
 
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise an error if the URI has an unknown option.
-
-    Args:
-        uri: The vehicle's address.
-        known: Every option that the driver reads.
-
-    Raises:
-        UnknownNameError: An option is not in ``known``; the message names the first.
-    """
+    """Raise :class:`UnknownNameError` for the first of the URI's options that is not in ``known``."""
     for name in uri.options:
         if name not in known:
             raise UnknownNameError(f"option of {uri.scheme}://", name, known)

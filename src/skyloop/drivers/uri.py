@@ -144,9 +144,8 @@ class VehicleUri:
 def host_and_port(text: str) -> tuple[str, int] | None:
     """Return a host and its port; None for anything else.
 
-    Args:
-        text: For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an
-            IPv6 address is in brackets, which are not part of the host.
+    For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an IPv6
+    address is in brackets, which are not part of the host.
     """
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 1 <= int(port) <= 65_535:
@@ -161,13 +160,9 @@ def host_and_port(text: str) -> tuple[str, int] | None:
 
 
 def parse_uri(text: str) -> VehicleUri:
-    """Parse a vehicle's address.
+    """Parse a vehicle's address, such as ``ardrone://192.168.1.1?camera=front``, which may be percent-encoded.
 
-    Args:
-        text: For example ``ardrone://192.168.1.1?camera=front``. Place and options may be percent-encoded.
-
-    Raises:
-        UsageError: The text has no scheme with ``://``, or gives an option twice.
+    Raises :class:`UsageError` if the text has no scheme with ``://``, or gives an option twice.
     """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):

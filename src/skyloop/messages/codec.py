@@ -83,8 +83,8 @@ _BY_PREFIX: Final = {
 def encode(sample: Sample) -> bytes:
     """Encode a sample as a packet.
 
-    Raises:
-        ValueError: The body is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
+    Raises ``ValueError`` if the body is larger than :data:`MAX_BODY`, which only free text or native telemetry can
+    cause.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:
@@ -93,16 +93,9 @@ def encode(sample: Sample) -> bytes:
 
 
 def decode(packet: bytes | memoryview) -> Sample:
-    """Decode a packet, in bounded time and memory.
+    """Decode a packet from any source, in bounded time and memory, and check its types, lengths and ranges.
 
-    Args:
-        packet: The bytes, which may come from any source.
-
-    Returns:
-        The sample, with its types, lengths and ranges checked.
-
-    Raises:
-        DecodeError: The bytes are not a packet with a valid sample.
+    Raises :class:`DecodeError` if the bytes are not a packet with a valid sample.
     """
     # One look-up checks signature, version, kind and reserved bytes; only a failure is analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))

@@ -137,10 +137,8 @@ class EarthOrigin(NamedTuple):
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
         """Return a geographic position in world axes: x east, y north, z up [m].
 
-        Args:
-            latitude_deg: Latitude [°], north positive.
-            longitude_deg: Longitude [°], east positive; the shorter way around the earth is used.
-            altitude_m: Altitude above mean sea level [m].
+        Latitude [°] is positive north, longitude [°] east, by the shorter way around the earth; the altitude [m] is
+        above mean sea level.
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)

@@ -20,17 +20,9 @@ ACTIONS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
-    """Return a drone's state as a row.
+    """Return the numbers of these names, from :data:`STATE`, in a drone's state; None if any is unknown.
 
-    Args:
-        feedback: The state.
-        names: Names of the numbers to return, from :data:`STATE`.
-
-    Returns:
-        The numbers, in the order of their names; None if any is unknown.
-
-    Raises:
-        UnknownNameError: A name is not in :data:`STATE`.
+    Raises :class:`UnknownNameError` for a name that is not in :data:`STATE`.
     """
     row = []
     for name in names:
@@ -48,14 +40,9 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
 
 def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
-    """Return the set-point in a row.
+    """Return the set-point of a kind in :data:`ACTIONS` from its numbers, in the order given there.
 
-    Args:
-        kind: A key of :data:`ACTIONS`.
-        row: Its numbers, in the order of :data:`ACTIONS`.
-
-    Raises:
-        UsageError: The row has the wrong length.
+    Raises :class:`UsageError` if the row has the wrong length.
     """
     names = ACTIONS[kind]
     if len(row) != len(names):
