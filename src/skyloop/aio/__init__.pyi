@@ -994,19 +994,11 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, AuthorityStatus]:
-        """Request the authority over all active drones.
+        """Request the authority over all active drones; return the status of each, by name.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: As for :meth:`Drone.request_authority`.
-            for_s: As for :meth:`Drone.request_authority`.
-            takeover: As for :meth:`Drone.request_authority`.
-            stay: As for :meth:`Drone.request_authority`.
-
-        Returns:
-            The status of each, by name.
+        Arguments are those of :meth:`Drone.request_authority`.
         """
     async def release_authority(self) -> None:
         """Release the authority over all active drones.
