@@ -301,7 +301,7 @@ def test_a_stream_without_key_pictures_is_left_to_ffmpeg_and_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("skyloop.drivers.live_container.STRICT_S", 0.5)
-    monkeypatch.setattr("skyloop.drivers.h264.KEYLESS", 10)
+    monkeypatch.setattr("skyloop.drivers.live_video.KEYLESS", 10)
     sink = RecordingSink(record=True)
     with RtspServer(Refreshed(without_key=False).next().payload) as server, camera(server.address, sink):
         with Projector(server.send, Refreshed(without_key=True)):

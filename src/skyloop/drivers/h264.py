@@ -1,4 +1,4 @@
-"""Just enough of H.264 to separate pictures, to detect missing, reordered or resized ones, and to forward the rest.
+"""Just enough of H.264 to separate pictures, and to detect missing, reordered or resized ones. Pure.
 
 ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annex B, Annex E.
 """
@@ -6,14 +6,10 @@ ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.drivers.base import Sink
 from skyloop.errors import DecodeError
-from skyloop.messages import EventKind, Intrinsics, Severity
-from skyloop.messages.frame import Chain
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
@@ -26,7 +22,6 @@ _ALL_COLOURS: Final = 3  # chroma_format_idc for 4:4:4
 _MAX_BLOCKS: Final = 1024  # maximum number of macroblocks per side, 16384 pixels
 _MAX_CYCLE: Final = 255
 _B: Final = 1  # slice_type of B slices, modulo 5
-KEYLESS: Final = 600  #: number of pictures without a key picture after which a stream is reported as not forwardable
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,101 +262,3 @@ def _set_number(unit: bytes) -> bytes:
         return bytes([bits.exp_golomb() % 256])
     except DecodeError:
         return b""
-
-
-class StreamRelay:
-    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
-
-    Whether pictures are also decoded makes no difference. Not thread-safe.
-    """
-
-    def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
-        self._sink = sink
-        self._intrinsics = intrinsics
-        self._chain = Chain()
-        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
-
-    def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
-        wanted = self._sink.wants_stream(camera)
-        if not wanted:
-            self.restart()
-        return wanted
-
-    def restart(self) -> None:
-        """Restart with the next key picture."""
-        self._source = None
-
-    def take(
-        self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
-    ) -> bool:
-        """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
-
-        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the pictures of the connection, so those
-        left out cause gaps. ``picture``: False if there are only parameters, which are not forwarded.
-        """
-        if not self.wanted(camera):
-            return False
-        source = camera, connection
-        if unit.after_gap or source != self._source:
-            self._chain.restart()
-        self._source = source
-        if not self._chain.follows(number, key=unit.is_key) or not picture:
-            return False
-        self._sink.stream(
-            camera,
-            unit.data,
-            captured_ns,
-            width=unit.width,
-            height=unit.height,
-            key=unit.is_key,
-            intrinsics=self._intrinsics(camera, unit.width, unit.height),
-        )
-        return True
-
-
-class CheckedRelay:
-    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
-
-    Not thread-safe.
-    """
-
-    def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:
-        self._relay = relay
-        self._sink = sink
-        self._camera = camera
-        self._where = where
-        self._refused = (-1, "")  # number of the connection, and the reason
-        self._waited = 0
-        self._reported = ""
-
-    @property
-    def wanted(self) -> bool:
-        """Whether the stream is wanted."""
-        return self._relay.wanted(self._camera)
-
-    def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
-        """Forward an undamaged picture; see :meth:`StreamRelay.take`.
-
-        ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded, for the rest of the
-        connection; empty if it can.
-        """
-        if not self.wanted:
-            return
-        if reason:
-            self._refused = connection, reason
-        if self._refused[0] == connection:
-            self._report(self._refused[1])
-            return
-        taken = unit is not None and self._relay.take(
-            self._camera, unit, captured_ns, number=number, connection=connection
-        )
-        self._waited = 0 if taken else self._waited + 1
-        if self._waited == KEYLESS:
-            self._report(f"{KEYLESS} pictures without a key picture (IDR) with parameters: configure the encoder")
-
-    def _report(self, why: str) -> None:
-        if why != self._reported:
-            self._reported = why
-            text = f"{self._where}: {why}: only decoded frames are available, not the original stream"
-            self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=self._where)

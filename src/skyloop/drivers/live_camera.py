@@ -20,8 +20,7 @@ from skyloop.address import without_secrets
 from skyloop.calibration import Calibration, load_calibration
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
-from skyloop.drivers.h264 import CheckedRelay, StreamRelay
-from skyloop.drivers.live_video import Coded, Decoder, LiveVideo, Picture, VideoEvent
+from skyloop.drivers.live_video import CheckedRelay, Coded, Decoder, LiveVideo, Picture, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value

@@ -1,4 +1,4 @@
-"""Receive a vehicle's live video, decode it, and show the newest picture.
+"""Receive a vehicle's live video, decode it, and show the newest picture; forward H.264 undecoded.
 
 One thread reads frames from the socket as they arrive, so that pictures don't age in a kernel buffer, and keeps
 reconnecting. Another one decodes the frames that are wanted. Between them, the :class:`FrameBacklog` decides which
@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.drivers.base import Sink
+from skyloop.drivers.h264 import Unit
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
+from skyloop.messages.frame import Chain
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
 REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
 LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
+KEYLESS: Final = 600  #: number of pictures without a key picture after which a stream is reported as not forwardable
 MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
 
 
@@ -386,3 +389,101 @@ class LiveVideo:
     def _emit(self, event: VideoEvent, text: str) -> None:
         if not self._stop.is_set():
             self._on_event(event, text)
+
+
+class StreamRelay:
+    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
+
+    Whether pictures are also decoded makes no difference. Not thread-safe.
+    """
+
+    def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
+        self._sink = sink
+        self._intrinsics = intrinsics
+        self._chain = Chain()
+        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
+
+    def wanted(self, camera: str) -> bool:
+        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
+        wanted = self._sink.wants_stream(camera)
+        if not wanted:
+            self.restart()
+        return wanted
+
+    def restart(self) -> None:
+        """Restart with the next key picture."""
+        self._source = None
+
+    def take(
+        self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
+    ) -> bool:
+        """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
+
+        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the pictures of the connection, so those
+        left out cause gaps. ``picture``: False if there are only parameters, which are not forwarded.
+        """
+        if not self.wanted(camera):
+            return False
+        source = camera, connection
+        if unit.after_gap or source != self._source:
+            self._chain.restart()
+        self._source = source
+        if not self._chain.follows(number, key=unit.is_key) or not picture:
+            return False
+        self._sink.stream(
+            camera,
+            unit.data,
+            captured_ns,
+            width=unit.width,
+            height=unit.height,
+            key=unit.is_key,
+            intrinsics=self._intrinsics(camera, unit.width, unit.height),
+        )
+        return True
+
+
+class CheckedRelay:
+    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
+
+    Not thread-safe.
+    """
+
+    def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:
+        self._relay = relay
+        self._sink = sink
+        self._camera = camera
+        self._where = where
+        self._refused = (-1, "")  # number of the connection, and the reason
+        self._waited = 0
+        self._reported = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the stream is wanted."""
+        return self._relay.wanted(self._camera)
+
+    def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
+        """Forward an undamaged picture; see :meth:`StreamRelay.take`.
+
+        ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded, for the rest of the
+        connection; empty if it can.
+        """
+        if not self.wanted:
+            return
+        if reason:
+            self._refused = connection, reason
+        if self._refused[0] == connection:
+            self._report(self._refused[1])
+            return
+        taken = unit is not None and self._relay.take(
+            self._camera, unit, captured_ns, number=number, connection=connection
+        )
+        self._waited = 0 if taken else self._waited + 1
+        if self._waited == KEYLESS:
+            self._report(f"{KEYLESS} pictures without a key picture (IDR) with parameters: configure the encoder")
+
+    def _report(self, why: str) -> None:
+        if why != self._reported:
+            self._reported = why
+            text = f"{self._where}: {why}: only decoded frames are available, not the original stream"
+            self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=self._where)

@@ -19,9 +19,9 @@ import numpy as np
 
 from skyloop.clock import Clock, LiveClock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.h264 import StreamRelay, Unit
+from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_camera import intrinsics_of
-from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
+from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveVideo, Picture, Stream, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics

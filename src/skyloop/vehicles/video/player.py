@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.h264 import CheckedRelay, StreamRelay, Unit
+from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_container import Units
+from skyloop.drivers.live_video import CheckedRelay, StreamRelay
 from skyloop.errors import FileFormatError, SkyloopError, UsageError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
 from skyloop.messages.frame import H264
