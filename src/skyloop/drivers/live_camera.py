@@ -73,11 +73,6 @@ class CameraSource:
         return without_secrets(self.name)
 
 
-def is_address(text: str) -> bool:
-    """Return whether a text is the address of a stream rather than a path."""
-    return "://" in text
-
-
 def source_of(text: str, where: str) -> CameraSource:
     """Parse the address of a camera, or a device's path; ``where`` begins error messages.
 

@@ -20,7 +20,6 @@ from skyloop.drivers.live_camera import (
     LiveCameraSettings,
     check_intrinsics,
     intrinsics_of,
-    is_address,
     source_of,
 )
 from skyloop.drivers.live_video import VideoEvent
@@ -262,7 +261,7 @@ def options_of(uri: VehicleUri) -> VideoOptions:
 
 def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
     place = uri.reveal_place()
-    if is_address(place):
+    if "://" in place:
         return Path(), source_of(place, f"{uri.scheme}://")
     path = expand(place)
     return path, CameraSource(str(path), "") if is_device(path) else None
