@@ -19,7 +19,7 @@ from benchmarks.measuring.schedule import SMALL
 from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 from benchmarks.one_core import codecs_on_one_core
 from skyloop.bench import Flight, Machine, Spread, rounds, spread
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.video import H264_360P

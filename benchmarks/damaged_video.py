@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.h264 import Inspector
 from skyloop.drivers.live_container import LiveDecoder, Piece
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.vehicles.ardrone.pave_decoder import av
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser

@@ -35,11 +35,8 @@ def is_loopback(host: str) -> bool:
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
     """Return a part of an address without anything that may be secret: user, password, query and keys.
 
-    Args:
-        text: The address of a stream, some other place, or the value of an option; percent-decoded.
-        option: Name of the option, if ``text`` is its value.
-        broken: Whether splitting the address may have cut a password in it.
-        place_of: Scheme of the vehicle's address, if ``text`` is the place in it.
+    ``text``, percent-decoded, is the address of a stream, the value of an ``option``, or the place in a vehicle's
+    address with the scheme ``place_of``. ``broken``: whether splitting the address may have cut a password in it.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
@@ -69,11 +66,7 @@ def is_broken(options: Iterable[str]) -> bool:
 
 
 def shown_address(text: str) -> str:
-    """Return a vehicle's address without anything that may be secret.
-
-    Args:
-        text: The user's input: ``scheme://place?option=value``, or anything else.
-    """
+    """Return the user's input, ``scheme://place?option=value`` or anything else, without what may be secret."""
     scheme, separator, rest = text.partition("://")
     place, mark, query = rest.partition("?")
     if not separator:

@@ -147,11 +147,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(times_ns: Sequence[float]) -> Spread:
-    """Compute the median and the 99th percentile of times.
-
-    Raises:
-        ValueError: There are no times, because no sample arrived.
-    """
+    """Compute the median and the 99th percentile of times. Raises ``ValueError`` if there are none."""
     if not times_ns:
         raise ValueError("not one sample arrived")
     values = np.asarray(times_ns, np.float64) / 1e3
@@ -172,21 +168,14 @@ def stamped(sent_ns: int) -> float:
 
 
 def stamp_of(up: float, now_ns: int) -> int:
-    """Decode the time within the last 18 minutes encoded by :func:`stamped` [ns].
-
-    Args:
-        up: The climb rate [m/s].
-        now_ns: The current time, on the same clock.
-    """
+    """Decode the time within the last 18 minutes [ns] that :func:`stamped` encoded as a climb rate [m/s]."""
     return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
     """A vehicle that hovers forever and produces feedback and frames on request, to measure only Skyloop.
 
-    Args:
-        received: Called on the applying thread with each new set-point.
-        camera: The vehicle's camera.
+    ``received`` is called on the applying thread with each new set-point.
     """
 
     shared = False
@@ -457,13 +446,8 @@ def measure_delays(
 ) -> DelayResults:
     """Measure Skyloop and the bare hand-over alternately, each between two processes.
 
-    Args:
-        seconds: Duration of each measurement at each frame size [s].
-        sizes: Width and height of the frames, at most :data:`LARGEST`.
-        progress: Called with the fraction done so far (0 to 1) and the next measurement's name.
-
-    Raises:
-        LinkError: The processes do not find each other, or nothing arrives.
+    Each measurement takes ``seconds`` for each frame size (width and height, at most :data:`LARGEST`). Raises
+    :class:`LinkError` if the processes do not find each other, or nothing arrives.
     """
     machine, rounds = Machine.here(), max(1, round(seconds / _TURN_S))
     turns = [_Turn(number, seconds / rounds, size) for number in range(rounds) for size in sizes]
@@ -658,13 +642,10 @@ class SimResults(msgspec.Struct, frozen=True):
 
 
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
-    """Measure physics and rendering on the calling thread, with OpenCV limited to that thread.
+    """Measure physics and rendering for about ``seconds`` on the calling thread, to which OpenCV is limited.
 
-    If Numba is installed, compiled code renders all images, including the first.
-
-    Args:
-        seconds: Approximate duration, without the time to build the scenes [s].
-        progress: Called with the fraction done so far (0 to 1) and the current measurement's name.
+    Building the scenes takes additional time. If Numba is installed, compiled code renders all images, including the
+    first.
     """
     from skyloop.sim.render.compiled import COMPILER
 

@@ -62,12 +62,7 @@ if hasattr(os, "register_at_fork"):  # without fork, nothing is inherited
 
 
 class ChildProcess:
-    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread.
-
-    Attributes:
-        pid: Process id of the child.
-        stdout: The child's standard output; open until :meth:`close`.
-    """
+    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread."""
 
     def __init__(
         self,
@@ -79,12 +74,9 @@ class ChildProcess:
     ) -> None:
         """Start the child.
 
-        Args:
-            command: Command line of the child.
-            keep_errors: Whether to keep its standard error for :attr:`last_words`; if False, the child shares this
-                process's standard error.
-            inherited: File descriptors that the child inherits.
-            handed: Data for :func:`handed_over` that must not be on a command line, which all users can read.
+        ``keep_errors``: whether to keep its standard error for :attr:`last_words`; if False, it shares this process's.
+        ``inherited``: file descriptors that it inherits. ``handed``: data for :func:`handed_over` that must not be on a
+        command line, which all users can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
@@ -104,7 +96,7 @@ class ChildProcess:
             raise
         assert self._process.stdout is not None
         self.pid = self._process.pid
-        self.stdout: IO[bytes] = self._process.stdout
+        self.stdout: IO[bytes] = self._process.stdout  #: open until :meth:`close`
         self._ours = True
         leave_to_parent(self)
 
@@ -217,10 +209,6 @@ class RestartingChild:
     """Keeps one child running, restarting it whenever it ends, until :meth:`stop`. Any thread.
 
     All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and every child is ended.
-
-    Attributes:
-        child: The current or last child; None before the first.
-        restarts: Number of restarts.
     """
 
     def __init__(
@@ -260,7 +248,7 @@ class RestartingChild:
         self._reader: threading.Thread | None = None
         self._name = name
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
-        self.child: ChildProcess | None = None
+        self.child: ChildProcess | None = None  #: the current or last one; None before the first
         self.restarts = 0
 
     @property
@@ -274,11 +262,7 @@ class RestartingChild:
         return not self._keeper.is_alive()
 
     def start(self) -> None:
-        """Start the first child. Call it only once.
-
-        Raises:
-            OSError: The child can't be started.
-        """
+        """Start the first child, once. Raises ``OSError`` if it can't be started."""
         self._begin()
         self._keeper.start()
 
@@ -352,9 +336,7 @@ class RestartingChild:
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
-    Args:
-        stop: Ends the child.
-        descriptor: The pipe's reading end; standard input in a :class:`ChildProcess`.
+    ``descriptor`` is the pipe's reading end; standard input in a :class:`ChildProcess`.
     """
 
     def watch() -> None:

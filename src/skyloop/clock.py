@@ -92,11 +92,7 @@ class ManualClock:
         return self.now_ns
 
     def advance(self, seconds_: float) -> int:
-        """Advance by ``seconds_`` and return the new time [ns].
-
-        Raises:
-            ValueError: If ``seconds_`` is negative.
-        """
+        """Advance by ``seconds_`` (``ValueError`` if negative) and return the new time [ns]."""
         if seconds_ < 0:
             raise ValueError(f"a monotonic clock cannot go back by {-seconds_} s")
         self.now_ns += nanoseconds(seconds_)
@@ -120,9 +116,8 @@ class LiveClock:
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
         """Return when a picture was captured, never later than it arrived.
 
-        Args:
-            stamp_s: Timestamp on the stream's clock [s]. A step back resets the estimate.
-            arrived_ns: Time of arrival, on this host's monotonic clock.
+        ``stamp_s`` is its timestamp on the stream's clock [s], where a step back resets the estimate; ``arrived_ns`` is
+        on this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
         if stamp_ns < self._stamp_ns:  # the stream's clock was set back, so reset the estimate

@@ -63,13 +63,9 @@ _IN_PYTHON: Final = {
 
 
 class SkyloopError(Exception):
-    """Base class of all errors that Skyloop raises on purpose.
+    """Base class of all errors that Skyloop raises on purpose."""
 
-    Attributes:
-        hint: A possible remedy, for programs with their own wording; None if the message says it all.
-    """
-
-    hint: Hint | None = None
+    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message says it all
 
     def with_hint(self, hint: Hint) -> Self:
         """Add a hint and return this error."""
@@ -90,30 +86,16 @@ class UsageError(SkyloopError, ValueError):
 
 
 class UnknownNameError(UsageError, KeyError):
-    """Raised when a name is unknown; ``suggestions`` holds the nearest known names, best first.
-
-    Attributes:
-        kind: What the name refers to, for example ``camera``.
-        name: The name that was given.
-        known: All known names, sorted.
-        suggestions: Up to three similar known names.
-        message: The error's text.
-    """
+    """Raised when a name is unknown; ``suggestions`` holds the nearest known names, best first."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], *, where: str = "") -> None:
-        """Compose the message, with suggestions from the known names.
-
-        Args:
-            kind: What the name refers to, for example ``camera``.
-            name: The name that was given.
-            known: All known names.
-            where: Where the name was looked up; it follows the name in the message, as in ``on the network``.
-        """
+        """Compose the message, with suggestions; ``where`` follows the name, as in ``on the network``."""
         choices = sorted(set(known))
-        self.kind = kind
-        self.name = name
-        self.known = choices
+        self.kind = kind  #: what the name refers to, for example ``camera``
+        self.name = name  #: the name that was given
+        self.known = choices  #: all known names, sorted
         self.where = where
+        #: Up to three similar known names.
         self.suggestions: list[str] = difflib.get_close_matches(name, choices, n=3, cutoff=0.5)
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
@@ -122,6 +104,7 @@ class UnknownNameError(UsageError, KeyError):
             hint = f"known: {shown}"
         else:
             hint = "none is known here"
+        #: The error's text.
         self.message = f"no {kind} named {name!r}{f' {where}' if where else ''}; {hint}"
         super().__init__(self.message)
 
@@ -150,25 +133,18 @@ class DecodeError(SkyloopError, ValueError):
 
 
 def install_command(*extras: str) -> str:
-    """Return the command that installs optional parts, both in a checkout and for an installed wheel.
-
-    Args:
-        extras: Names of the optional parts.
-    """
+    """Return the command that installs optional parts, by name, both in a checkout and for an installed wheel."""
     return f"skyloop install {' '.join(extras)}"
 
 
 class MissingExtraError(SkyloopError, ImportError):
-    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``."""
+    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``.
+
+    ``what`` is the feature that needs it, ``cause`` why the import failed, if known.
+    """
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
-        """Compose the message.
-
-        Args:
-            what: The feature that needs the optional part.
-            extra: Name of the extra for ``skyloop install``.
-            cause: Why the import failed, if known.
-        """
+        """Compose the message."""
         self.what = what
         self.extra = extra
         self.cause = cause
@@ -215,23 +191,12 @@ class ClosedError(LinkError):
 
 
 class SwarmError(SkyloopError):
-    """Raised when an action fails for some drones of a swarm; the message has one line for each of them.
-
-    Attributes:
-        errors: The exceptions, by name of the drone.
-        total: Number of drones in the swarm.
-    """
+    """Raised when an action fails for some drones of a swarm; the message has one line for each of them."""
 
     def __init__(self, what: str, errors: Mapping[str, Exception], total: int) -> None:
-        """Compose the message.
-
-        Args:
-            what: Name of the failed action.
-            errors: The exceptions, by name of the drone.
-            total: Number of drones in the swarm.
-        """
-        self.errors = dict(errors)
-        self.total = total
+        """Compose the message; ``what`` is the name of the failed action."""
+        self.errors = dict(errors)  #: the exceptions, by name of the drone
+        self.total = total  #: number of drones in the swarm
         self._what = what
         lines = "".join(f"\n  {name}: {type(error).__name__}: {error}" for name, error in self.errors.items())
         super().__init__(f"{what} failed for {len(self.errors)} of {total} drones:{lines}")

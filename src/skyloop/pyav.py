@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 
 def require_pyav(purpose: str) -> None:
-    """Check that PyAV is installed.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
+    """Raise :class:`MissingExtraError`, which says what it is needed for, unless PyAV is installed."""
     try:
         import av  # noqa: F401
     except ImportError as error:
@@ -31,16 +27,10 @@ def require_pyav(purpose: str) -> None:
 def new_decoder(
     codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = False, low_delay: bool = True
 ) -> VideoCodecContext:
-    """Create a decoder that returns each image at once.
+    """Create a decoder that returns each image at once; ``codec`` is FFmpeg's name. See :func:`require_pyav`.
 
-    Args:
-        codec: FFmpeg's name for the codec.
-        purpose: As for :func:`require_pyav`.
-        patch: Whether to fill damaged parts from earlier images; if not, a damaged image is an error.
-        low_delay: False for a stream whose images depend on later ones, until whose arrival they are delayed.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
+    With ``patch``, damaged parts are filled from earlier images; otherwise a damaged image is an error. ``low_delay``
+    is False for a stream whose images depend on later ones, until whose arrival they are delayed.
     """
     require_pyav(purpose)
     import av
@@ -78,18 +68,10 @@ _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:
 class H264Encoder:
     """Encodes one stream, returning each image at once. Use from one thread at a time.
 
-    H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame.
-
-    Args:
-        width: Width of the images [px], even.
-        height: Height of the images [px], even.
-        fps: Approximate frame rate.
-        kbit_s: Average rate [kbit/s].
-        varies: Whether the rate will change, increasing up to threefold. x264 fixes the largest burst when it starts,
-            so a constant rate is kept more strictly.
-
-    Raises:
-        MissingExtraError: PyAV is not installed, or lacks x264.
+    H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame. Width
+    and height [px] must be even. If the average rate [kbit/s] ``varies``, it may increase up to threefold; x264 fixes
+    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError`
+    without PyAV or x264.
     """
 
     def __init__(self, width: int, height: int, fps: float, kbit_s: int, *, varies: bool = False) -> None:
@@ -145,8 +127,7 @@ class H264Encoder:
             captured_ns: Capture time [ns], later than the previous one.
             key: Whether to make it a key frame.
 
-        Returns:
-            The access unit, and whether it is a key frame. Empty if the encoder returned none.
+        Returns the access unit, empty if the encoder returned none, and whether it is a key frame.
         """
         import av
 

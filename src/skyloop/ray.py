@@ -11,8 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Final, Self
 
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
@@ -23,15 +21,6 @@ _LOOK_S: Final = 0.1  # how often to check whether all actors have started
 _START_S: Final = 60.0  #: time limit for Ray to place and start all actors
 #: This program's environment variables that a worker needs to find the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
-
-
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """An actor's task, sent to its host."""
-
-    kind: type[Any]
-    drone: str
-    settings: Settings
 
 
 class Workers:
@@ -75,9 +64,7 @@ class Workers:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
 
@@ -129,8 +116,7 @@ def process(
         ray.cloudpickle.register_pickle_by_value(module)
     options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
-    task = _Order(code.kind, drone, settings)
-    found = Workers([actor.remote(task) for _ in range(workers)])
+    found = Workers([actor.remote(code.kind, drone, settings) for _ in range(workers)])
     try:
         _await_start(found)
     except BaseException:
@@ -165,24 +151,24 @@ def _await_start(workers: Workers) -> None:
 class _Actor:
     """One worker, on a host chosen by Ray."""
 
-    def __init__(self, task: _Order) -> None:
+    def __init__(self, kind: type[Any], drone: str, settings: Settings) -> None:
         self._trouble = ""
         self._worker: Worker | None = None
         try:
-            self._begin(task)
+            self._begin(kind, drone, settings)
         except SkyloopError as error:
             self._trouble = str(error)
         except Exception as error:  # noqa: BLE001  (the user's class may raise anything)
-            self._trouble = f"{task.kind.__name__}() raised {error!r}"
+            self._trouble = f"{kind.__name__}() raised {error!r}"
 
-    def _begin(self, task: _Order) -> None:
+    def _begin(self, kind: type[Any], target: str, settings: Settings) -> None:
         from skyloop.client import connect
 
-        name = f"{task.settings.name[:32]}@{os.uname().nodename[:20]}:{os.getpid()}"
-        processor = Code(task.kind, task.settings.code).make()
-        drone = connect(task.drone, access="observe", name=name)
+        name = f"{settings.name[:32]}@{os.uname().nodename[:20]}:{os.getpid()}"
+        processor = Code(kind, settings.code).make()
+        drone = connect(target, access="observe", name=name)
         try:
-            self._worker = Worker(drone, processor, task.settings, print)
+            self._worker = Worker(drone, processor, settings, print)
         except BaseException:
             drone.close()
             raise

@@ -61,15 +61,7 @@ class Place:
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Parse TOML.
-
-    Args:
-        text: The file's text.
-        source: The file's name, for messages.
-
-    Raises:
-        FileFormatError: The text is not TOML.
-    """
+    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if it is not TOML."""
     if _DEEP_KEY.search(text):
         raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:
@@ -80,15 +72,10 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
-    """Convert parsed values to a struct.
+    """Convert the result of :func:`parse_toml` to a struct that forbids unknown keys.
 
-    Args:
-        values: The result of :func:`parse_toml`.
-        source: The file's name, for messages.
-        kind: A :class:`msgspec.Struct`, with tables and lists of tables as fields, that forbids unknown keys.
-
-    Raises:
-        FileFormatError: A key is missing or unknown, or a value has the wrong type or is out of range.
+    Its fields may be tables and lists of tables. Raises :class:`FileFormatError` if a key is missing or unknown, or a
+    value has the wrong type or is out of range.
     """
     try:
         with _converting:

@@ -144,22 +144,15 @@ Zone = Box | Cylinder
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Where a vehicle may fly.
+    """Where a vehicle may fly."""
 
-    Attributes:
-        room: The room's walls, which the vehicle can't pass; None if unknown.
-        box: The safety box; None if there is none.
-        zones: The no-fly zones, as written.
-        barriers: The zones, made at least :data:`THINNEST_M` thick.
-    """
-
-    room: Box | None = None
-    box: Box | None = None
-    zones: tuple[Zone, ...] = ()
-    barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)  # the zones as they are enforced
+    room: Box | None = None  #: the room's walls, which the vehicle can't pass; None if unknown
+    box: Box | None = None  #: the safety box; None if there is none
+    zones: tuple[Zone, ...] = ()  #: the no-fly zones, as written
+    #: The zones as they are enforced, made at least :data:`THINNEST_M` thick.
+    barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Thicken zones that are too thin."""
         object.__setattr__(self, "barriers", tuple(zone.thickened() for zone in self.zones))
 
     @property
@@ -195,14 +188,9 @@ class Space:
 
 
 def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
-    """Return the space in which parameters allow a vehicle to fly.
+    """Return the space in which parameters, whose values the functions return by name, allow a vehicle to fly.
 
-    Args:
-        number: Returns the value of a numeric parameter by its name.
-        text: Returns the value of a text parameter by its name.
-
-    Raises:
-        ParameterError: The zones can't be parsed.
+    Raises :class:`ParameterError` if the zones can't be parsed.
     """
     low = (number(f"{BOX}.x_low"), number(f"{BOX}.y_low"), number(f"{BOX}.z_low"))
     high = (number(f"{BOX}.x_high"), number(f"{BOX}.y_high"), number(f"{BOX}.z_high"))
@@ -219,14 +207,10 @@ def _room(text: str) -> Box | None:
 
 
 def parse_zones(text: str) -> tuple[Zone, ...]:
-    """Parse zones, separated by semicolons.
+    """Parse zones, separated by semicolons. Raises :class:`ParameterError` if that fails, or there are too many.
 
-    Args:
-        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. Each may be
-            preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.
-
-    Raises:
-        ParameterError: The text can't be parsed, or has too many zones.
+    A zone is ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. It may be
+    preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.
     """
     zones = [_parse_zone(part) for part in text.split(";") if part.strip()]
     if len(zones) > MAX_ZONES:
@@ -263,8 +247,7 @@ def _parse_zone(text: str) -> Zone:
 def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
     """Check a new value for a safety parameter against the others.
 
-    Raises:
-        ParameterError: A wall of the box is beyond the opposite one, or the zones can't be parsed.
+    Raises :class:`ParameterError` if a wall of the box is beyond the opposite one, or the zones can't be parsed.
     """
     if name == ZONES:
         parse_zones(str(value))

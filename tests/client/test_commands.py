@@ -244,7 +244,7 @@ def test_a_landing_requested_during_an_autopilots_return_stays_the_callers_when_
 ) -> None:
     """It was requested again as the library's own, and refused."""
     # Once the lease is back, everything that waited for it is too old to be sent, or nothing is.
-    monkeypatch.setattr(drone._commands._schedule, "_keep_ns", -1 if pressed.startswith("long") else 10 * NS_PER_S)
+    monkeypatch.setattr("skyloop.client.actions._KEEP_NS", -1 if pressed.startswith("long") else 10 * NS_PER_S)
     in_rtl = "the vehicle is in RTL, which was not chosen here"
     proxy.state = FlightState.FLYING
     drone.wait(lambda feedback: feedback.state is FlightState.FLYING, WAIT_S)

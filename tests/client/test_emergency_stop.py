@@ -12,7 +12,7 @@ from skyloop.client import actions
 from skyloop.client.actions import CommandSchedule
 from skyloop.client.drone import Drone
 from skyloop.clock import NS_PER_S, ManualClock
-from skyloop.drivers.motor_stop import GIVE_UP_NS
+from skyloop.drivers.vehicle_session import GIVE_UP_NS
 from skyloop.errors import RefusedError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,
@@ -114,7 +114,7 @@ def test_commands_blocked_by_a_stop_are_reported(proxy: ScriptedProxy, drone: Dr
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
-    proxy.until(lambda: not drone._commands.stopping)
+    proxy.until(lambda: not drone._commands.schedule.stopping)
     assert drone.hover()
 
 

@@ -110,7 +110,7 @@ def test_a_hover_of_the_same_program_is_not_ended_by_the_next_leg() -> None:
         flight.run(seconds=10.0)
         assert flight.law.state == "paused"
         assert math.hypot(*(drone.feedback().position_m or ())[:2]) < 0.4
-        assert not drone._commands._schedule.automatic, "the requested hover continues"
+        assert not drone._commands.schedule.automatic, "the requested hover continues"
     assert told[-1].text == TAKEN
 
 

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyloop.drivers.camera_options import source_of
 from skyloop.drivers.h264 import PPS, SPS, START, unit_type, units
-from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
+from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings, source_of
 from skyloop.drivers.recording_sink import RecordingSink, SeenPicture
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, Intrinsics
@@ -302,7 +301,7 @@ def test_a_stream_without_key_pictures_is_left_to_ffmpeg_and_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("skyloop.drivers.live_container.STRICT_S", 0.5)
-    monkeypatch.setattr("skyloop.drivers.live_frames.KEYLESS", 10)
+    monkeypatch.setattr("skyloop.drivers.live_video.KEYLESS", 10)
     sink = RecordingSink(record=True)
     with RtspServer(Refreshed(without_key=False).next().payload) as server, camera(server.address, sink):
         with Projector(server.send, Refreshed(without_key=True)):

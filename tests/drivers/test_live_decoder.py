@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.h264 import SPS, START, Inspector, unit_type, units
 from skyloop.drivers.live_container import HOPELESS_S, STRICT_S, LiveDecoder, Piece
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.emulation.video import Encoder, Format
 from tests.support.film import FPS, GROUP, HEIGHT, WIDTH, Film

@@ -294,7 +294,7 @@ def test_set_points_are_sent_at_one_tick_and_the_spread_is_measured(field: Field
         for count in range(5):
             sent = drones.send({name: Velocity(0.1 * count, 0.01 * n) for n, name in enumerate(NAMES)})
             assert sent == dict.fromkeys(NAMES, True)
-            assert max(drone._commands.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
+            assert max(drone._commands.schedule.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
         spread = drones.spread
         assert before is None
         assert spread is not None

@@ -103,7 +103,7 @@ class FakeRay(ModuleType):
     def remote(self, kind: type[Any]) -> Any:
         def options(**given: Any) -> Any:
             self.options = given
-            return SimpleNamespace(remote=lambda order: Actor(lambda: kind(order)))
+            return SimpleNamespace(remote=lambda *order: Actor(lambda: kind(*order)))
 
         return SimpleNamespace(options=options)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyloop.calibration import Calibration, load_calibration
-from skyloop.drivers.camera_options import check_intrinsics, intrinsics_of
+from skyloop.drivers.live_camera import check_intrinsics, intrinsics_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Intrinsics

@@ -47,12 +47,9 @@ class Config:
     def __init__(self, sync: client.Config) -> None:
         """Wrap parameters of a connected drone."""
     async def get(self, name: str) -> Value:
-        """Return the current value.
+        """Return the current value. Raises :class:`UnknownNameError`, with suggestions, for an unknown name.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
-
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
         """
     async def set(self, name: str, value: object) -> None:
         """Write one value.
@@ -86,8 +83,7 @@ class Config:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
+        Raises :class:`UnknownNameError`, with suggestions, if there is no such parameter.
         """
 
 class Drone:
@@ -104,9 +100,7 @@ class Drone:
     def __init__(self, sync: client.Drone) -> None:
         """Wrap a connected drone."""
     async def __aenter__(self) -> Drone: ...
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def log(self) -> client.Logbook:
@@ -640,9 +634,6 @@ class Drone:
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
@@ -676,9 +667,6 @@ class Drone:
             depth: How many pictures may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
@@ -697,9 +685,6 @@ class Drone:
                 to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
                 after the proxy's ``authority.ask_s``.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called.
             ClosedError: If the drone was closed.
@@ -707,13 +692,11 @@ class Drone:
     def on_overview(
         self, function: Callable[[Overview], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
+        """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop, once a second.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop.
         """
     def on_feedback(
         self,
@@ -753,33 +736,27 @@ class Drone:
     def on_command(
         self, function: Callable[[Applied], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with the proxy's echo of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 echoes wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop.
         """
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each application's drawings on frames.
+        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 drawings wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
-        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        Args:
-            function: Called on the event loop; up to 256 entries wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called on the event loop.
         """
     def on_result(
         self,
@@ -801,9 +778,6 @@ class Drone:
                 listener's ``expired``. None: no limit.
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called or another argument is out of range.
@@ -855,12 +829,7 @@ class Swarm:
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
         """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
-        Args:
-            function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
-            what: Name of the action in error messages; empty: the function's name.
-
-        Returns:
-            Its results, by name.
+        It is a coroutine function. Its exceptions, ``what`` and the result are as for :meth:`skyloop.Swarm.each`.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
@@ -889,10 +858,6 @@ class Swarm:
         Args:
             wait: Wait until each hovers.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land all active drones at their current positions, at the same time; see :meth:`Drone.land`.
@@ -902,10 +867,6 @@ class Swarm:
         Args:
             wait: Wait until each has landed.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def go_to(
         self,
@@ -1033,19 +994,11 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, AuthorityStatus]:
-        """Request the authority over all active drones.
+        """Request the authority over all active drones; return the status of each, by name.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: As for :meth:`Drone.request_authority`.
-            for_s: As for :meth:`Drone.request_authority`.
-            takeover: As for :meth:`Drone.request_authority`.
-            stay: As for :meth:`Drone.request_authority`.
-
-        Returns:
-            The status of each, by name.
+        Arguments are those of :meth:`Drone.request_authority`.
         """
     async def release_authority(self) -> None:
         """Release the authority over all active drones.
@@ -1059,10 +1012,6 @@ class Swarm:
 
         Args:
             max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.

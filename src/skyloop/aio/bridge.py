@@ -153,7 +153,8 @@ def on_loop(member: Any) -> Any:
             raise UsageError(f"{member.__name__}: inline must be False, as the function runs on the event loop")
         return Listener(plain(self, from_thread(function) if callable(function) else function, *args, **given))
 
-    call.__doc__ = (call.__doc__ or "").replace("in its own thread", "on the event loop")
+    where = r"in its own thread( or, with ``inline``, on the receiving one)?"
+    call.__doc__ = re.sub(where, "on the event loop", call.__doc__ or "")
     signature = inspect.signature(member)
     takes = signature.parameters["function"].annotation
     either = re.sub(r"^(Callable\[\[.*\], )(.*)\]$", r"\1\2 | Awaitable[\2]]", takes)
@@ -388,12 +389,7 @@ class Swarm:
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
         """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
-        Args:
-            function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
-            what: Name of the action in error messages; empty: the function's name.
-
-        Returns:
-            Its results, by name.
+        It is a coroutine function. Its exceptions, ``what`` and the result are as for :meth:`skyloop.Swarm.each`.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}

@@ -67,6 +67,8 @@ _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
+_MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two set-points, not counting repeats
+_KEEP_NS: Final = nanoseconds(0.5)  #: maximum age at which a set-point that could not be sent is still sent later
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
 _STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval at which a stop is repeated, whatever the rate of other commands
 
@@ -118,22 +120,13 @@ def return_action(height_m: object, land: object) -> ReturnToStart:
 
 
 def in_world_axes(
-    local: tuple[object, object, object],
-    earth: tuple[object, object, object],
-    newest: Feedback | None,
-    age_s: float,
+    local: tuple[object, object, object], earth: tuple[object, object, object], newest: Feedback | None, age_s: float
 ) -> tuple[object, object, object]:
     """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
 
-    Args:
-        local: x, y, z in world axes [m].
-        earth: Latitude and longitude [°], and altitude above mean sea level [m]; None: the current height.
-        newest: The newest feedback.
-        age_s: Its age [s].
-
-    Raises:
-        UsageError: If both forms or neither are given, or a value is not a number or not on the earth.
-        RefusedError: If the vehicle's geographic position is unknown.
+    ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m],
+    None for the current height. Raises :class:`UsageError` if both forms or neither are given, or a value is not a
+    number or not on the earth, and :class:`RefusedError` if the vehicle's geographic position is unknown.
     """
     if all(one is None for one in earth):
         if any(one is None for one in local):
@@ -219,20 +212,11 @@ class Unsent(NamedTuple):
 class CommandSchedule:
     """Stores the newest set-point of one application. Times are on this process's clock."""
 
-    def __init__(
-        self, *, rate_hz: float = 32.0, stall_s: float = 1.0, min_interval_s: float = 0.005, keep_s: float = 0.5
-    ) -> None:
-        """Start without a set-point.
+    def __init__(self, *, rate_hz: float = 32.0, stall_s: float = 1.0) -> None:
+        """Start without a set-point; repeat at 1 to 200 Hz. Raises :class:`UsageError` if an argument is out of range.
 
-        Args:
-            rate_hz: Rate of repeats, 1 to 200 Hz.
-            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-                Flights to a target and returns do not decay: the vehicle stops there.
-            min_interval_s: Minimum time between two set-points of the application [s], not counting repeats.
-            keep_s: Maximum age at which a set-point commanded without a link is still sent once the link is back [s].
-
-        Raises:
-            UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
+        After ``stall_s`` without a call, a velocity or attitude decays to hover; ``math.inf``: never. Flights to a
+        target and returns do not decay: the vehicle stops there.
         """
         if not 1.0 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
@@ -240,8 +224,6 @@ class CommandSchedule:
             raise UsageError(f"stall_s is {stall_s!r} and must be more than 0 s (math.inf: never)")
         self._period_ns = nanoseconds(1.0 / rate_hz)
         self._stall_ns = None if stall_s == float("inf") else nanoseconds(stall_s)
-        self._min_interval_ns = nanoseconds(min_interval_s)
-        self._keep_ns = nanoseconds(keep_s)
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
         self.automatic = False  #: whether the newest set-point is the library's own
@@ -252,7 +234,7 @@ class CommandSchedule:
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
         # period longer, and only the application's commands delay the next one.
         self._first_ns = self._period_ns * 5 // 4
-        self._new_sent_ns = -self._min_interval_ns  # time at which the newest intent was first sent
+        self._new_sent_ns = -_MIN_INTERVAL_NS  # time at which the newest intent was first sent
         self._sent_intent = 0
         self.due_ns = 0  #: time from which :meth:`next` has something to send
         self._failsafe = Failsafe.NONE
@@ -276,7 +258,7 @@ class CommandSchedule:
         if stops or type(action) in _DONE_IN:  # rare and important, so send it at once
             self.due_ns = now_ns
         else:
-            self.due_ns = max(now_ns, self._new_sent_ns + self._min_interval_ns)
+            self.due_ns = max(now_ns, self._new_sent_ns + _MIN_INTERVAL_NS)
         return self.intent
 
     @property
@@ -298,7 +280,7 @@ class CommandSchedule:
     @property
     def open_ns(self) -> int:
         """Time from which a new set-point is sent at once [ns]."""
-        return self._new_sent_ns + self._min_interval_ns
+        return self._new_sent_ns + _MIN_INTERVAL_NS
 
     def next(self, now_ns: int) -> AnyAction | None:
         """Return the action to send now, under the current :attr:`intent`; None if it is too early."""
@@ -338,7 +320,7 @@ class CommandSchedule:
         The library's own actions revoke everything except a landing.
         """
         owed = self.owed
-        if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
+        if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > _KEEP_NS:
             return None
         if self.automatic and type(owed.action) is not Land:
             return None
@@ -386,7 +368,7 @@ class CommandSchedule:
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
         """Resume sending on the connection made at ``connected_ns``, without a set-point that is too old."""
-        if now_ns - self._asked_ns > self._keep_ns:  # on this connection, only the lease was missing
+        if now_ns - self._asked_ns > _KEEP_NS:  # on this connection, only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

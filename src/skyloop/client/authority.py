@@ -64,26 +64,17 @@ def check_seconds(what: str, seconds: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """This application's right to command.
+    """This application's right to command."""
 
-    Attributes:
-        state: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command.
-            ``preempted``: taken over by another application; waiting in the queue to get it back.
-        lease: Number of the lease while held, otherwise 0.
-        priority: Priority of the last request, 0 (highest) to 31.
-        holder: Name of the application that holds the authority; None if there is none or it is unknown.
-        position: Position in the queue, 1 being next; 0 if unknown.
-        expected_wait_s: Wait if all those ahead in the queue keep to their announced times [s]; None if unknown.
-        until_ns: End of the time that this application requested, on the proxy's clock; None: unlimited.
-    """
-
+    #: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command. ``preempted``:
+    #: taken over by another application; waiting in the queue to get it back.
     state: AuthorityState = "none"
-    lease: int = 0
-    priority: int = DEFAULT_PRIORITY
-    holder: str | None = None
-    position: int = 0
-    expected_wait_s: float | None = None
-    until_ns: int | None = None
+    lease: int = 0  #: number of the lease while held, otherwise 0
+    priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
+    holder: str | None = None  #: name of the application that holds it; None if there is none or it is unknown
+    position: int = 0  #: position in the queue, 1 being next; 0 if unknown
+    expected_wait_s: float | None = None  #: if all those ahead keep to their announced times [s]; None if unknown
+    until_ns: int | None = None  #: end of the time that was requested, on the proxy's clock; None: unlimited
 
 
 class EndedSessions:
@@ -286,11 +277,7 @@ class TakeoverQuery:
 
 
 def authority_request(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
-    """Return the request for the authority; its arguments are those of :class:`Authority`.
-
-    Raises:
-        UsageError: If an argument is out of range.
-    """
+    """Return the request for the authority; arguments and errors are those of :class:`Authority`."""
     if not isinstance(priority, int) or not HIGHEST_PRIORITY <= priority <= LOWEST_PRIORITY:
         raise UsageError(f"priority is {priority!r} and must be a whole number from 0 (highest) to 31 (lowest)")
     if takeover not in ("now", "ask"):

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from types import TracebackType
 from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 from skyloop.errors import ClosedError, SkyloopError, UsageError
@@ -175,16 +174,11 @@ class Listener(Generic[T]):
         inline: bool = False,
         on_cancel: Callable[[Listener[T]], None] | None = None,
     ) -> None:
-        """Start calling ``function``.
+        """Start calling ``function`` with each sample of ``channel``, of which ``depth`` may wait.
 
-        Args:
-            function: Called with each sample.
-            channel: The source of the samples.
-            report: Called with this listener's name and each exception of ``function``.
-            name: Name for the thread and for error messages.
-            depth: How many samples may wait.
-            inline: Call the function on the publishing thread instead of its own.
-            on_cancel: Called with this listener when it is cancelled.
+        ``report`` is called with this listener's ``name``, which its thread has, too, and each exception of
+        ``function``; ``on_cancel`` with this listener. ``inline``: call the function on the publishing thread instead
+        of its own.
         """
         self.name = name
         self.errors = 0  #: number of calls that raised
@@ -233,9 +227,7 @@ class Listener(Generic[T]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.cancel()
 
     def _run(self) -> None:

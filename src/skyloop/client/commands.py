@@ -12,15 +12,7 @@ from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.monitoring import ChannelCounter
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    Hint,
-    LinkError,
-    NoAnswerError,
-    RefusedError,
-    UnsupportedError,
-)
+from skyloop.errors import AuthorityError, ClosedError, Hint, LinkError, NoAnswerError, RefusedError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -101,7 +93,7 @@ class CommandSender:
         """
         self.role = role
         self._authority = authority
-        self._schedule = schedule
+        self.schedule = schedule  #: the set-point that is repeated; changed only here
         self._connection = connection
         self._clock = scheduler.clock
         self._emit = emit
@@ -133,36 +125,26 @@ class CommandSender:
     @property
     def intent(self) -> int:
         """Number of the newest intent."""
-        return self._schedule.intent
-
-    @property
-    def open_ns(self) -> int:
-        """Time on this process's clock from which a new set-point is sent at once [ns]."""
-        return self._schedule.open_ns
+        return self.schedule.intent
 
     def latest(self, *kinds: type[AnyAction]) -> int:
         """Return the number of the newest intent of these kinds; 0 if there was none."""
-        return max(self._schedule.latest.get(kind, 0) for kind in kinds)
+        return max(self.schedule.latest.get(kind, 0) for kind in kinds)
 
     @property
     def newest(self) -> AnyAction:
         """The action being repeated; idle if there is none."""
-        return self._schedule.action
+        return self.schedule.action
 
     @property
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps the vehicle in the air or brings it there."""
-        return self._schedule.wants_flight
+        return self.schedule.wants_flight
 
     def bar(self) -> None:
         """Bar the application's commands except an emergency stop; once this returns, none is still being sent."""
         with self._lock:
             self.barred = True
-
-    @property
-    def stopping(self) -> bool:
-        """Whether an emergency stop is in progress: it is repeated, and nothing else is sent."""
-        return self._schedule.stopping
 
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
@@ -184,7 +166,7 @@ class CommandSender:
             known_ns = self._present_until_ns
             if known_ns is None or until_ns <= known_ns:
                 return
-            absent, schedule = known_ns < self._clock(), self._schedule
+            absent, schedule = known_ns < self._clock(), self.schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
             ends = kind is Land or (kind is Hover and not schedule.automatic)  # by a person, who may be waiting for it
             if absent and not ends:  # an old set-point must not be revived when the person returns
@@ -203,10 +185,8 @@ class CommandSender:
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action``, with numbers already checked, the newest set-point; see :class:`skyloop.Drone`.
 
-        Args:
-            action: The action.
-            now: Raise if it can't be sent at once; in that case only a landing is still sent later.
-            automatic: Whether it is the library's own: never takes a vehicle from others, and passes :meth:`bar`.
+        With ``now``, raise if it can't be sent at once; in that case only a landing is still sent later. ``automatic``:
+        it is the library's own, so it never takes a vehicle from others, and passes :meth:`bar`.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.
@@ -241,7 +221,7 @@ class CommandSender:
         Sending is impossible while the link is down, the authority or an emergency stop's effect is awaited, or the
         person flying is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
         """
-        connection, schedule, authority = self._connection, self._schedule, self._authority
+        connection, schedule, authority = self._connection, self.schedule, self._authority
         if connection.why_closed:
             raise ClosedError(connection.why_closed)
         if why := self._impossible.get(type(action)):
@@ -271,7 +251,7 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
-            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within keep_s.
+            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within 0.5 s.
             absent = self._present_until_ns is not None and now_ns > self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
@@ -287,9 +267,9 @@ class CommandSender:
     def outcome(self, intent: int) -> Outcome | None:
         """Return the outcome of an intent that has ended; None while, as far as is known, it is in progress."""
         with self._lock:
-            if intent != self._schedule.intent:
+            if intent != self.schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
-            return self._schedule.over
+            return self.schedule.over
 
     @property
     def may_ask(self) -> bool:
@@ -299,7 +279,7 @@ class CommandSender:
     def drop(self) -> None:
         """Clear the set-point, so that it is not sent later."""
         with self._lock:
-            self._schedule.clear(Fate.WITHDRAWN)
+            self.schedule.clear(Fate.WITHDRAWN)
 
     def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
@@ -358,7 +338,7 @@ class CommandSender:
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
-            self._schedule.clear(Fate.AUTHORITY)
+            self.schedule.clear(Fate.AUTHORITY)
             changed = self._authority.given_back()
         if known and self._connection.connected:
             if wait:
@@ -380,7 +360,7 @@ class CommandSender:
     def disconnected(self) -> None:
         """Clear the set-point and the authority, so that nothing old is sent on the next connection."""
         with self._lock:
-            self._schedule.clear(Fate.LINK)
+            self.schedule.clear(Fate.LINK)
             self.told = None
             changed = self._authority.disconnected()
         if changed:
@@ -391,7 +371,7 @@ class CommandSender:
         with self._lock:
             before = self.status
             changed = self._authority.feedback(sample, now_ns)
-            self._schedule.observe(sample, now_ns, self.app_id)
+            self.schedule.observe(sample, now_ns, self.app_id)
             if sample.outcome is not None and sample.outcome.app_id == self.app_id:
                 self.told = sample.outcome
         if changed:
@@ -409,7 +389,7 @@ class CommandSender:
         """Send everything due; return the latest time of the next call, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
-            authority, schedule, present = self._authority, self._schedule, self.is_present(now_ns)
+            authority, schedule, present = self._authority, self.schedule, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
             if authority.wanted and present and asks:
                 self._ask_now = False
@@ -436,7 +416,7 @@ class CommandSender:
     # Inside ----------------------------------------------------------------------------------------------------
 
     def _send_next(self, now_ns: int) -> bool:
-        schedule = self._schedule
+        schedule = self.schedule
         action = schedule.next(now_ns)
         if action is None:
             return False
@@ -484,9 +464,9 @@ class CommandSender:
         status = self.status
         with self._lock:
             if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
-                self._schedule.resume(now_ns, self._connected_ns)
+                self.schedule.resume(now_ns, self._connected_ns)
             elif before.state == "held" and status.state != "held":
-                self._schedule.clear(Fate.AUTHORITY)
+                self.schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)
         self._notify()
@@ -500,19 +480,12 @@ class CommandSender:
         status = self.status
         if self.role is Role.OBSERVER:
             return AuthorityError(f"{action.name}: this application only observes", code="observer").with_hint(Hint.FLY)
-        if status.state == "preempted":
-            return AuthorityError(
-                f"{action.name}: {status.holder or 'another application'} took over the authority; "
-                "it returns when they release it",
-                code="no_authority",
-            )
-        if status.state == "queued":
-            return AuthorityError(
-                f"{action.name}: {status.holder or 'another application'} holds the authority, and this application "
-                "waits in the queue",
-                code="no_authority",
-            )
-        return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
+        holder = status.holder or "another application"
+        why = {
+            "preempted": f"{holder} took over the authority; it returns when they release it",
+            "queued": f"{holder} holds the authority, and this application waits in the queue",
+        }.get(status.state, "call request_authority() first")
+        return AuthorityError(f"{action.name}: {why}", code="no_authority")
 
     def _not_now(self, action: AnyAction) -> LinkError | AuthorityError:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""

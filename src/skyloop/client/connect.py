@@ -303,8 +303,7 @@ class PrivateProxy:
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> NetworkSettings | None:
     """Return the settings for searching the network; None for this host only. ``keys``: from the command line.
 
-    Raises:
-        UsageError: If an address or the folder is invalid.
+    Raises :class:`UsageError` if an address or the folder is invalid.
     """
     if isinstance(network, Network):
         address, keys = network.address, network.keys or keys

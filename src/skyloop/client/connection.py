@@ -17,14 +17,7 @@ from skyloop.client.monitoring import Thresholds
 from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
-from skyloop.messages import (
-    AnyReply,
-    AnyRequest,
-    Hello,
-    LinkState,
-    Refused,
-    Welcome,
-)
+from skyloop.messages import AnyReply, AnyRequest, Hello, LinkState, Refused, Welcome
 from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
@@ -69,43 +62,43 @@ class ProxyConnection:
         self._clock = clock
         self._topics: list[str] = []
         self._lock = threading.Lock()  # guards the topics and the switch between sessions
-        self._session: ProxySession | None = None
+        self.session: ProxySession | None = None  #: the current one; switched under the lock
         self._malformed_before = self._missing_before = 0  # totals of earlier sessions
 
     @property
     def connected(self) -> bool:
         """Whether, as far as is known, a proxy is at the other end and has answered Hello."""
-        session = self._session
+        session = self.session
         return session is not None and session.open
 
     @property
     def malformed(self) -> int:
         """Number of undecodable packets and frames in all sessions."""
-        session = self._session
+        session = self.session
         return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
 
     @property
     def missing(self) -> int:
         """Number of feedback samples missing in all sessions, judged by gaps in their numbers."""
-        session = self._session
+        session = self.session
         return self._missing_before + (0 if session is None else session.monitor.missing)
 
     @property
     def receiving(self) -> bool:
         """Whether the calling thread is the receiving one, which must not wait for packets."""
-        session = self._session
+        session = self.session
         return session is not None and session.receiving
 
     @property
     def variants(self) -> bool:
         """Whether frames arrive in the requested form; within one host, they arrive unchanged."""
-        session = self._session
+        session = self.session
         return session is not None and session.variants
 
     @property
     def offset_ns(self) -> int:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
-        session = self._session
+        session = self.session
         return 0 if session is None else session.offset_ns
 
     @property
@@ -116,7 +109,7 @@ class ProxyConnection:
     @property
     def uncertainty_ns(self) -> int:
         """Maximum error of :attr:`offset_ns` [ns]; 0 if both ends read the same clock."""
-        session = self._session
+        session = self.session
         return 0 if session is None else session.uncertainty_ns
 
     def check_open(self) -> None:
@@ -136,7 +129,7 @@ class ProxyConnection:
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
         """Receive on the calling thread; see :meth:`skyloop.transport.base.TransportClient.lead`."""
-        session = self._session
+        session = self.session
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
@@ -148,40 +141,34 @@ class ProxyConnection:
                 self._topics.append(topic)
             else:
                 self._topics.remove(topic)
-            if self._session is not None:
-                self._session.subscribe(topic, on)
+            if self.session is not None:
+                self.session.subscribe(topic, on)
 
     def resubscribe(self, topic: str) -> None:
         """Resubscribe to a topic that seems to have stopped."""
         with self._lock:
-            if topic in self._topics and self._session is not None:
-                self._session.subscribe(topic, False)
-                self._session.subscribe(topic, True)
+            if topic in self._topics and self.session is not None:
+                self.session.subscribe(topic, False)
+                self.session.subscribe(topic, True)
 
     def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
         """Send a request without waiting.
 
         ``done`` is called once, on any thread, with the answer or, after ``timeout_s``, an error; it must be quick.
         """
-        session = self._session
+        session = self.session
         if session is None:
             done(LinkError(f"the link is {self.state.value}: {self.reason}"))
         else:
             session.requests.ask(body, done, timeout_s, self._clock())
 
     def call(
-        self,
-        body: Callable[[], AnyRequest],
-        timeout_s: float = 2.0,
-        *,
-        may_repeat: Callable[[], bool] = lambda: True,
+        self, body: Callable[[], AnyRequest], timeout_s: float = 2.0, *, may_repeat: Callable[[], bool] = lambda: True
     ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
-        Args:
-            body: Called for each attempt; returns the request.
-            timeout_s: Total time [s].
-            may_repeat: Whether to repeat the request if the link breaks between sending it and receiving the answer.
+        ``body`` returns the request, for each attempt, ``may_repeat`` whether to repeat it if the link breaks between
+        sending it and receiving the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
@@ -199,7 +186,7 @@ class ProxyConnection:
 
         deadline = time.monotonic() + timeout_s
         while not self.closing:
-            left_s, sent = deadline - time.monotonic(), self._session is not None
+            left_s, sent = deadline - time.monotonic(), self.session is not None
             self.ask(body(), done, max(left_s, 0.001))
             notifier.wait_for(lambda: bool(answers), left_s + 1.0)
             answer = answers.pop() if answers else NoAnswerError("the link's thread has ended")
@@ -218,29 +205,24 @@ class ProxyConnection:
             f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect again here"
         )
         self.closing = True
-        self._session, self.transmit = None, _nowhere
+        self.session, self.transmit = None, _nowhere
         self.state, self.reason = LinkState.CLOSED, "the connection belongs to the parent process"
 
     # For the supervisor ----------------------------------------------------------------------------------------
-
-    @property
-    def session(self) -> ProxySession | None:
-        """The current session, if there is one."""
-        return self._session
 
     def attach(self, session: ProxySession) -> None:
         """Send through ``session`` from now on, and subscribe to all active topics in it."""
         with self._lock:
             for topic in self._topics:
                 session.subscribe(topic, True)
-            self._session = session
+            self.session = session
             self.transmit = session.transmit
         self.poke()
 
     def detach(self) -> ProxySession | None:
         """Stop sending until there is another session; return the previous one."""
         with self._lock:
-            session, self._session = self._session, None
+            session, self.session = self.session, None
             self.transmit = _nowhere
         if session is not None:
             self._malformed_before += session.monitor.malformed_count
@@ -279,10 +261,8 @@ class ConnectionSupervisor:
     def start(self, timeout_s: float = 5.0) -> None:
         """Connect for the first time, within ``timeout_s``, and stay connected from then on.
 
-        Raises:
-            NoAnswerError: If the proxy does not answer Hello.
-            RefusedError: If the proxy refuses the connection.
-            SkyloopError: Any other error of the dialer.
+        Raises :class:`NoAnswerError` if the proxy does not answer Hello, :class:`RefusedError` if it refuses the
+        connection, and the dialer's errors.
         """
         deadline = time.monotonic() + timeout_s
         ended = False
@@ -370,8 +350,7 @@ class ConnectionSupervisor:
     def _connect(self) -> None:
         """Dial and send Hello. The attempt counts as failed until feedback arrives; if it never does, pauses grow."""
         self._failures += 1
-        session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock)
-        session.dial(self._dial)
+        session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock, self._dial)
         try:
             welcome = self._welcome(session)
             self._handler.connected(welcome)

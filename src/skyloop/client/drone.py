@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Literal, ParamSpec, Self, TypedDict, TypeVar, Unpack
 
 import msgspec
@@ -49,14 +48,7 @@ from skyloop.client.publishing import Logbook, checked_time
 from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
 from skyloop.client.telemetry import ClientState, LinkStatus, SessionSamples, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    LinkError,
-    NoAnswerError,
-    UnknownNameError,
-    UsageError,
-)
+from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
     AnyAction,
@@ -236,19 +228,9 @@ class Drone:
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
-        Args:
-            timeout_s: Time for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to
-                start up [s].
-            authority: How a pilot requests the authority; None: ``Authority()``.
-            acquire: Whether to request the authority now; if False, the pilot does so later.
-            wait_for_state: Whether to wait for feedback.
-            wake_s: Time for the vehicle to start up once it may be commanded, if that is longer [s].
-
-        Raises:
-            NoAnswerError: If no answer or no feedback arrives in time.
-            RefusedError: If the proxy refuses the connection.
-            AuthorityError: If the authority is not granted.
-            LinkError: If the proxy can't be reached.
+        ``timeout_s`` is for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to start
+        up, for which it has ``wake_s`` once it may be commanded, if that is longer. With ``acquire=False``, a pilot
+        requests the authority later. Errors are those of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -355,7 +337,7 @@ class Drone:
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
         if found["command"].delay_s is None and self._connection.connected and not self._connection.receiving:
-            found["command"] = _with_delay(found["command"], self._proxy_statistics())
+            found["command"] = replace(found["command"], delay_s=_delay(self._proxy_statistics()))
         return found
 
     def recent_events(self) -> list[Event]:
@@ -369,9 +351,6 @@ class Drone:
             function: Called in its own thread. It returns True to hand the authority over, False or a reason (a text)
                 to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
                 after the proxy's ``authority.ask_s``.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called.
@@ -593,12 +572,7 @@ class Drone:
         self._piloting.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 
     def return_to_start(
-        self,
-        height_m: float | None = None,
-        *,
-        land: bool | None = None,
-        wait: bool = True,
-        timeout_s: float = 180.0,
+        self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
         """Fly back to where the vehicle took off, and land there or hover.
 
@@ -689,12 +663,7 @@ class Drone:
 
     # Reading ---------------------------------------------------------------------------------------------------
 
-    def feedback(
-        self,
-        *,
-        max_age_s: float | None = None,
-        max_hz: float | None = None,
-    ) -> Feedback:
+    def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback.
 
         An observer receives only as much data as its consumers need, and every sample as long as none of them limits
@@ -828,11 +797,7 @@ class Drone:
                 raise self._state.no_frame(channel.camera.name, timeout_s)
 
     def frames(
-        self,
-        camera: str | None = None,
-        *,
-        timeout_s: float = 5.0,
-        **how: Unpack[VideoOptions],
+        self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> Iterator[Frame]:
         """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
@@ -910,11 +875,7 @@ class Drone:
     # Callbacks -------------------------------------------------------------------------------------------------
 
     def on_feedback(
-        self,
-        function: Callable[[Feedback], object],
-        *,
-        inline: bool = False,
-        max_hz: float | None = None,
+        self, function: Callable[[Feedback], object], *, inline: bool = False, max_hz: float | None = None
     ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 
@@ -931,11 +892,9 @@ class Drone:
         return self._listen(channel, function, "feedback", inline=inline)
 
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
-        """Call ``function`` with each overview of all vehicles in the proxy's process; see :meth:`overview`.
+        """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
-        Args:
-            function: Called in its own thread, once a second.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
@@ -954,29 +913,23 @@ class Drone:
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
-        """Call ``function`` with the proxy's echo of each command of any application.
+        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
 
-        Args:
-            function: Called in its own thread; up to 256 echoes wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
-        """Call ``function`` with each application's drawings on frames.
+        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
 
-        Args:
-            function: Called in its own thread; up to 256 drawings wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with each application's log entries, this one's included (see ``drone.log``).
+        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
 
-        Args:
-            function: Called in its own thread; up to 256 entries wait for it.
-            inline: Call it on the receiving thread instead.
+        It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
 
@@ -997,9 +950,6 @@ class Drone:
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
@@ -1046,9 +996,6 @@ class Drone:
             scale: Factor for width and height, above 0 and up to 1.
             depth: How many pictures may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
-
-        Returns:
-            The listener; ``cancel()`` ends it.
 
         Raises:
             UsageError: If ``function`` can't be called or an option is out of range.
@@ -1183,9 +1130,6 @@ class Drone:
             depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
-        Returns:
-            The listener; ``cancel()`` ends it.
-
         Raises:
             UsageError: If ``function`` can't be called or another argument is out of range.
             ClosedError: If the drone was closed.
@@ -1249,8 +1193,8 @@ class Drone:
             deadline_s = time.monotonic() + JOIN_S  # shared by all of them
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
-            for one in list(self._state.to_close):
-                one.close()
+            for close in list(self._state.to_close):
+                close()
             self._state.wake_all()
             if self._on_close is not None:
                 self._on_close()
@@ -1259,9 +1203,7 @@ class Drone:
         self._connection.check_open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         problem = self._piloting.end_flight()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)
@@ -1309,17 +1251,9 @@ def open_drone(
     authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
-    """Connect through a dialer; applications call :func:`skyloop.connect`.
+    """Connect through a dialer, now and again after each loss; applications call :func:`skyloop.connect`.
 
-    Args:
-        dial: Connects to the proxy, first now and again after each loss.
-        app: Name of this application, 1 to 64 characters.
-        timeout_s: Time for the proxy to answer, to send feedback and for the vehicle to start up [s].
-        authority: As for :func:`skyloop.connect`.
-        **options: See :class:`DroneOptions`.
-
-    Raises:
-        SkyloopError: The same as for :func:`skyloop.connect`.
+    ``app`` is the application's name, 1 to 64 characters; for the others, see there and :class:`DroneOptions`.
     """
     drone = Drone(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, authority=authority)
@@ -1337,20 +1271,12 @@ def _from_numpy(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
 
 
-def _with_delay(stats: ChannelStats, statistics: Statistics | None) -> ChannelStats:
-    """Return the statistics with the proxy's measured delay from sending to applying."""
+def _delay(statistics: Statistics | None) -> Distribution | None:
+    """Return the proxy's measured delay from sending to applying; None if there is none."""
     counters = {} if statistics is None else statistics.counters
     count = int(counters.get("commands.delay.count", 0))
     if not count:
-        return stats
+        return None
     median = counters.get("commands.delay.median_s", 0.0)
-    return replace(
-        stats,
-        delay_s=Distribution(
-            median=median,
-            p99=counters.get("commands.delay.p99_s", median),
-            maximum=counters.get("commands.delay.max_s", median),
-            mean=counters.get("commands.delay.mean_s", median),
-            count=count,
-        ),
-    )
+    p99, most, mean = (counters.get(f"commands.delay.{name}_s", median) for name in ("p99", "max", "mean"))
+    return Distribution(median, p99, most, mean, count)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 else:
     _Base = np.ndarray
 
-_CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
 _PNG_LEVEL: Final = 1  #: fastest compression: notebooks display pictures at once and rarely keep them
 _ATTRIBUTES: Final = frozenset(
@@ -106,11 +105,7 @@ class Frame(_Base):
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
-        """Return a writable plain array with the same pixels, to draw on.
-
-        Args:
-            order: Memory layout, as for :meth:`numpy.ndarray.copy`.
-        """
+        """Return a writable plain array with the same pixels, to draw on; ``order`` as for :func:`numpy.copy`."""
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:
@@ -154,6 +149,7 @@ class Arrival:
     __slots__ = (
         "_clock",
         "_frame",
+        "_full",
         "_history",
         "_image",
         "_lock",
@@ -172,12 +168,18 @@ class Arrival:
         offset_ns: int,
         history: FeedbackHistory,
         clock: Clock = time.monotonic_ns,
+        scale: float = 1.0,
     ) -> None:
         """Store a frame received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
 
-        ``history`` provides the state at the time of capture.
+        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled
+        down by the factor ``scale`` for width and height when it is decoded.
         """
-        self.header = header
+        self.header = self._full = header
+        if scale != 1.0:
+            small = scaled_header(header, scale)
+            size = small.width * small.height * 3
+            self.header = msgspec.structs.replace(small, encoding=Encoding.BGR8, size=size)
         self.received_ns = received_ns
         self._pixels: Pixels | None = pixels
         self._image: NDArray[np.uint8] | None = None
@@ -194,39 +196,26 @@ class Arrival:
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
     def as_came(self) -> Pixels | None:
-        """Return the bytes as received from the transport, shape (size,); None once the image is decoded."""
+        """Return the bytes as received, shape (size,); None once the image is decoded, or if it is scaled down."""
         with self._lock:
-            return self._pixels
+            return self._pixels if self._full is self.header else None
 
     def frame(self) -> Frame:
-        """Return the frame, decoded on the first call.
-
-        Raises:
-            DecodeError: If the pixels do not match the header.
-            MissingExtraError: If it is a JPEG and OpenCV is not installed.
-        """
+        """Return the frame, decoded on the first call. Raises the errors of :func:`to_bgr`."""
         with self._lock:
             frame = self._frame() if self._frame is not None else None
-            if frame is None:
-                frame = self._make()
-                self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
+            if frame is not None:
+                return frame
+            if self._image is None:
+                assert self._pixels is not None
+                image = to_bgr(self._full, self._pixels)
+                self._image = image if self._full is self.header else resized(image, self.header)
+                self._image.flags.writeable = False
+                self._pixels = None
+            frame = self._image.view(Frame)
+            frame._arrival = self
+            self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
             return frame
-
-    def _picture(self) -> NDArray[np.uint8]:
-        """Decode to BGR. Raises :class:`DecodeError`."""
-        assert self._pixels is not None
-        return to_bgr(self.header, self._pixels)
-
-    def _make(self) -> Frame:
-        image = self._image
-        if image is None:
-            image = self._image = self._picture()
-            if image.flags.writeable:
-                image.flags.writeable = False
-            self._pixels = None
-        frame = image.view(Frame)
-        frame._arrival = self
-        return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
         """Return the vehicle's state at the time of capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
@@ -241,43 +230,10 @@ class Arrival:
         return feedback, reach_s
 
 
-class SmallArrival(Arrival):
-    """A frame received larger than its consumer requested, and scaled down during decoding."""
-
-    __slots__ = ("_full",)
-
-    def __init__(
-        self,
-        header: FrameHeader,
-        pixels: Pixels,
-        received_ns: int,
-        offset_ns: int,
-        history: FeedbackHistory,
-        clock: Clock,
-        scale: float,
-    ) -> None:
-        """Store a frame; ``header`` describes it as received, ``scale`` is the factor for width and height."""
-        small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
-        small = msgspec.structs.replace(small, size=small.width * small.height * 3)
-        super().__init__(small, pixels, received_ns, offset_ns, history, clock)
-        self._full = header
-
-    def as_came(self) -> Pixels | None:
-        """Return None, because the frame was not received in this size."""
-        return None
-
-    def _picture(self) -> NDArray[np.uint8]:
-        assert self._pixels is not None
-        picture: NDArray[np.uint8] = resized(to_bgr(self._full, self._pixels), self.header)
-        return picture
-
-
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
     """Return a frame as a JPEG, to store many of them; :meth:`Arrival.frame` decodes it.
 
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-        LinkError: OpenCV could not encode it as JPEG.
+    Raises :class:`MissingExtraError` without OpenCV, and :class:`LinkError` if that could not encode it.
     """
     from_ = frame._arrival
     plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
@@ -287,21 +243,11 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
     return Arrival(header, pixels, from_.received_ns, from_._offset_ns, from_._history, from_._clock)
 
 
-def size_error(header: FrameHeader, size: int) -> str:
-    """Return why ``size`` bytes can't be the frame announced by ``header``; empty if they can."""
-    channels = _CHANNELS.get(header.encoding)
-    expected = header.size if channels is None else header.width * header.height * channels
-    if size == expected:
-        return ""
-    return f"frame {header.seq} of {header.camera} has {size} bytes and should have {expected}"
-
-
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
     """Convert a frame's bytes to BGR, shape (height, width, 3), uint8, without a copy if they are BGR.
 
-    Raises:
-        DecodeError: If the pixels are not a JPEG of the size in the header.
-        MissingExtraError: If they are a JPEG and OpenCV is not installed.
+    Raises :class:`DecodeError` if they are not a JPEG of the size in the header, and :class:`MissingExtraError` if they
+    are one and OpenCV is not installed.
     """
     height, width = header.height, header.width
     encoding = header.encoding
@@ -343,15 +289,10 @@ class FeedbackHistory:
         samples.append(sample)
 
     def at(self, captured_ns: int) -> tuple[Feedback | None, float | None, bool]:
-        """Return the state at a time on the proxy's clock.
+        """Return the state at a time on the proxy's clock, its reach [s], and whether there was a sample on each side.
 
-        Args:
-            captured_ns: Time on the proxy's clock [ns].
-
-        Returns:
-            The state, its reach [s], and whether there was a sample on each side. The reach is the time to the more
-            distant sample used. With samples on one side only, the state is the nearest sample unchanged; with none,
-            state and reach are None.
+        The reach is the time to the more distant sample used. With samples on one side only, the state is the nearest
+        sample unchanged; with none, state and reach are None.
         """
         samples = list(self._samples)
         if not samples:
@@ -368,14 +309,9 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Interpolate the state linearly between two samples, with angles along the shorter way.
+    """Interpolate the state at a time between two samples linearly, with angles along the shorter way.
 
     Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
-
-    Args:
-        a: The earlier sample.
-        b: The later sample.
-        captured_ns: A time between them.
     """
     share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
     nearer = a if share < 0.5 else b

@@ -95,17 +95,13 @@ class LinkMonitor:
         if last is not None:
             if seq <= last:
                 return False
-            if seq != last + 1:
-                self._gap(seq - last - 1, skipped, now_ns)
+            gap = seq - last - 1
+            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy left out as many before each missing one, too
+                self.missing += -((skipped - gap) // (skipped + 1))
         self._last_seq = seq
         self.feedback_ns = now_ns
         self.received += 1
         return True
-
-    def _gap(self, gap: int, skipped: int, now_ns: int) -> None:
-        """Count the samples missing in a gap, given that ``skipped`` are left out before each one."""
-        if gap > skipped and now_ns >= self._no_gaps_ns:
-            self.missing += -((skipped - gap) // (skipped + 1))
 
     def malformed(self) -> None:
         """Record a packet that could not be decoded."""
@@ -173,11 +169,7 @@ class Offset:
     uncertainty_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Trip:
-    sent_ns: int  # on our clock; the drift bounds how much the offset has changed since
-    low_ns: int
-    high_ns: int
+_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: time on our clock, since when the bounds have widened
 
 
 class OffsetEstimator:
@@ -200,7 +192,7 @@ class OffsetEstimator:
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
         """Add a round trip, answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
-        self._trips.append(_Trip(sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
+        self._trips.append((sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
 
     def at(self, now_ns: int) -> Offset:
@@ -216,8 +208,9 @@ class OffsetEstimator:
         return Offset((low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2)
 
     def _bounds(self, trip: _Trip, now_ns: int) -> tuple[int, int]:
-        drift_ns = round(max(0, now_ns - trip.sent_ns) * self._max_drift)
-        return trip.low_ns - drift_ns, trip.high_ns + drift_ns
+        sent_ns, low_ns, high_ns = trip
+        drift_ns = round(max(0, now_ns - sent_ns) * self._max_drift)
+        return low_ns - drift_ns, high_ns + drift_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,28 +226,18 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class ChannelStats:
-    """Statistics of one channel since the drone was connected. Unknown values are None.
+    """Statistics of one channel since the drone was connected. Unknown values are None."""
 
-    Attributes:
-        count: Samples received; for commands, commands sent.
-        rate_hz: Samples per second, over the last two seconds.
-        lost: Samples missing, judged by gaps in their numbers; for video including those that the proxy left out.
-        dropped: Samples replaced by newer ones before their consumer took them; for commands, those that the transport
-            did not accept.
-        malformed: Undecodable samples.
-        delay_s: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
-        age_s: Time since the newest sample's capture.
-        uncertainty_s: Maximum error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
-    """
-
-    count: int = 0
-    rate_hz: float = 0.0
-    lost: int = 0
+    count: int = 0  #: samples received; for commands, commands sent
+    rate_hz: float = 0.0  #: samples per second, over the last two seconds
+    lost: int = 0  #: missing, judged by gaps in their numbers; for video including those that the proxy left out
+    #: Replaced by newer ones before their consumer took them; for commands, those that the transport did not accept.
     dropped: int = 0
-    malformed: int = 0
+    malformed: int = 0  #: undecodable samples
+    #: From publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
     delay_s: Distribution | None = None
-    age_s: float | None = None
-    uncertainty_s: float = 0.0
+    age_s: float | None = None  #: time since the newest sample's capture
+    uncertainty_s: float = 0.0  #: maximum error of both from comparing two hosts' clocks; 0 on one host
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:

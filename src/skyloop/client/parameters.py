@@ -115,11 +115,7 @@ class Config(Mapping[str, Value]):
         self._restorer = restorer
 
     def __getitem__(self, name: str) -> Value:
-        """Return the current value.
-
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
-        """
+        """Return the current value. Raises :class:`UnknownNameError`, with suggestions, for an unknown name."""
         return self.describe(name).value
 
     def __setitem__(self, name: str, value: object) -> None:
@@ -145,8 +141,7 @@ class Config(Mapping[str, Value]):
     def describe(self, name: str) -> Parameter:
         """Return a parameter's type, unit, range, default, value and description.
 
-        Raises:
-            UnknownNameError: If there is no such parameter; carries suggestions.
+        Raises :class:`UnknownNameError`, with suggestions, if there is no such parameter.
         """
         answer = self._call(name, lambda: GetParameter(_name(name)))
         if not isinstance(answer, ParameterValue):

@@ -13,14 +13,7 @@ from skyloop.client.actions import OUTDONE, OVERRULED
 from skyloop.client.commands import LANDING, CommandSender, GivenUpError, cancelled
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
-from skyloop.errors import (
-    AuthorityError,
-    ClosedError,
-    NoAnswerError,
-    RefusedError,
-    SkyloopError,
-    UnsupportedError,
-)
+from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, SkyloopError, UnsupportedError
 from skyloop.messages import (
     AnyAction,
     EmergencyStop,
@@ -54,10 +47,6 @@ _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
 _log = logging.getLogger("skyloop")
-
-
-def _silent(step: str) -> None:
-    """Report nothing."""
 
 
 class Piloting:
@@ -167,7 +156,7 @@ class Piloting:
             _log.info("%s: %s, because %s", self._state.name, action.name, reason)
         return sent
 
-    def end_flight(self, report: Callable[[str], object] = _silent) -> SkyloopError | None:
+    def end_flight(self, report: Callable[[str], object] = lambda _: None) -> SkyloopError | None:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
         From the start, commands from the application's other threads raise :class:`ClosedError`; only an emergency stop
@@ -185,7 +174,7 @@ class Piloting:
                 self._close()
 
     def bring_down(
-        self, reason: str, report: Callable[[str], object] = _silent, *, land: bool = True
+        self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
         """Land and wait for the landing if this application flies the vehicle, or let go; see :meth:`end_flight`."""
         self.finish_stop()
@@ -218,7 +207,7 @@ class Piloting:
     def finish_stop(self) -> None:
         """Wait up to 2 s until the vehicle reports an emergency stop, which would otherwise end with the connection."""
         if self._connection.connected and not self._connection.receiving:
-            self._state.notifier.wait_for(lambda: not self.commands.stopping, STOP_S)
+            self._state.notifier.wait_for(lambda: not self.commands.schedule.stopping, STOP_S)
 
     def _is_down(self) -> bool:
         newest = self._state.newest
@@ -280,11 +269,7 @@ class ActionWait:
         return commands.intent != self._intent and not behind
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
-        """Wait until the action is done.
-
-        Args:
-            timeout_s: The caller's time-out [s], for the error.
-            deadline_s: The deadline, on ``time.monotonic``.
+        """Wait until the action is done, until ``deadline_s`` on ``time.monotonic``; errors name ``timeout_s``.
 
         Raises:
             NoAnswerError: If it is not done in time.

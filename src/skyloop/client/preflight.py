@@ -42,52 +42,31 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PreflightFinding:
-    """One line of the checklist.
+    """One line of the checklist."""
 
-    Attributes:
-        check: The subject: ``link``, ``battery``, ``position`` and so on.
-        level: How serious the finding is.
-        detail: The result.
-        why: Why it matters; empty if all is well.
-        remedy: What to do about it; empty if nothing.
-    """
-
-    check: str
-    level: Level
-    detail: str
-    why: str = ""
-    remedy: str = ""
+    check: str  #: the subject: ``link``, ``battery``, ``position`` and so on
+    level: Level  #: how serious the finding is
+    detail: str  #: the result
+    why: str = ""  #: why it matters; empty if all is well
+    remedy: str = ""  #: what to do about it; empty if nothing
 
 
 @dataclass(frozen=True, slots=True)
 class PreflightState:
-    """The known state of a vehicle before a flight.
-
-    Attributes:
-        name: The drone's name, for commands in remedies.
-        link: State of both hops.
-        capabilities: The vehicle's capabilities.
-        feedback: The newest sample; None if there is none yet.
-        feedback_age_s: Its age [s].
-        video_age_s: Age of each camera's newest picture [s]; None: none arrived in time.
-        parameters: Values by name; empty: they were not read.
-        clock_uncertainty_s: Uncertainty of all samples' ages [s].
-        video_waited_s: Time spent waiting for pictures [s].
-        app_id: This application's number in this run of the proxy.
-        free_bytes: Free space of the disk for recordings; None: not requested.
-    """
+    """The known state of a vehicle before a flight."""
 
     link: LinkStatus
     capabilities: Capabilities
-    feedback: Feedback | None = None
+    feedback: Feedback | None = None  #: the newest sample; None if there is none yet
     feedback_age_s: float | None = None
+    #: Age of each camera's newest picture; None: none arrived in time.
     video_age_s: Mapping[str, float | None] = field(default_factory=dict)
-    parameters: Mapping[str, Value] = field(default_factory=dict)
-    clock_uncertainty_s: float = 0.0
-    app_id: int = 0
-    free_bytes: int | None = None
-    video_waited_s: float = 0.0
-    name: str = "NAME"
+    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty: they were not read
+    clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
+    app_id: int = 0  #: this application's number in this run of the proxy
+    free_bytes: int | None = None  #: free space of the disk for recordings; None: not requested
+    video_waited_s: float = 0.0  #: time spent waiting for pictures
+    name: str = "NAME"  #: the drone's name, for commands in remedies
 
 
 class Inspected(Protocol):

@@ -151,7 +151,7 @@ class Membership:
         self.code = code
         self.shared = shared
         #: Called at each renewal; returns whether this worker can take frames. False gives its share to the others.
-        self.ready: Callable[[], bool] = _always
+        self.ready: Callable[[], bool] = lambda: True
         #: The newest share; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None
         #: Called on the receiving thread when the share has changed.
@@ -167,10 +167,9 @@ class Membership:
     def start(self, timeout_s: float) -> None:
         """Join, and renew the membership from then on in a separate thread.
 
-        Raises:
-            NameTakenError: If another application runs other code under this name.
-            RefusedError: If the proxy refuses for another reason.
-            LinkError: If the proxy does not answer within ``timeout_s``, or the drone is closed.
+        Raises :class:`NameTakenError` if another application runs other code under this name, :class:`RefusedError` if
+        the proxy refuses for another reason, and :class:`LinkError` if it does not answer in time or the drone is
+        closed.
         """
         self._state.on_share.add(self._take_share, lambda: 0)
         self._state.on_welcome.add(self._take_welcome, lambda: 0)
@@ -182,7 +181,7 @@ class Membership:
             self._leave()
             raise
         self._thread.start()
-        self._state.to_close.append(self)
+        self._state.to_close.append(self.close)
 
     def renew(self) -> None:
         """Renew at once, for example because :attr:`ready` has changed. Thread-safe."""
@@ -254,7 +253,3 @@ def _error(refused: Refused) -> SkyloopError:
     if refused.code is Refusal.NAME_TAKEN:
         return NameTakenError(refused.message)
     return RefusedError(refused.message, code=refused.code.value)
-
-
-def _always() -> bool:
-    return True

@@ -89,19 +89,14 @@ class Result:
     def value(self) -> Any:
         """The return value of ``process``, with dataclasses as dicts, tuples as lists, and read-only arrays.
 
-        Raises:
-            DecodeError: If the payload is malformed, which only a foreign program can send.
+        Raises :class:`DecodeError` if the payload is malformed, which only a foreign program can send.
         """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
         return self._value
 
     def to(self, kind: type[T]) -> T:
-        """Return the value as a dataclass, ``msgspec.Struct`` or other type.
-
-        Raises:
-            DecodeError: If it can't be converted.
-        """
+        """Return the value as a dataclass, ``msgspec.Struct`` or other type, or raise :class:`DecodeError`."""
         try:
             return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
         except (msgspec.ValidationError, TypeError) as error:
@@ -270,9 +265,7 @@ class ResultChannels:
     def channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, even if no such processor runs.
 
-        Raises:
-            UsageError: If ``processor`` is not a valid name.
-            ClosedError: If the drone was closed.
+        Raises :class:`UsageError` for an invalid name, and :class:`ClosedError` if the drone was closed.
         """
         self._connection.check_open()
         return self._made(checked_name(processor))

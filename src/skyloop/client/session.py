@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from skyloop.client.frame import size_error
-from skyloop.client.monitoring import LinkMonitor, Offset, OffsetEstimator, StallWatch, Thresholds
+from skyloop.client.monitoring import LinkMonitor, OffsetEstimator, StallWatch, Thresholds
 from skyloop.clock import Clock, clock_identity, nanoseconds
 from skyloop.errors import DecodeError, LinkError, NoAnswerError
 from skyloop.messages import (
@@ -28,8 +27,9 @@ from skyloop.messages import (
     decode,
     encode,
 )
+from skyloop.messages.fields import CHANNELS
 from skyloop.messages.subscription import PLAIN
-from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, stream, video
+from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
 RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
 
@@ -69,14 +69,8 @@ class Requests:
                 self._last_id += 1
                 number = self._last_id
                 packet = encode(Request(number, body))
-                self._pending[number] = _Pending(
-                    packet,
-                    type(body).__name__,
-                    done,
-                    now_ns + nanoseconds(timeout_s),
-                    now_ns + nanoseconds(again_s),
-                    timeout_s,
-                )
+                deadline_ns, again_ns = now_ns + nanoseconds(timeout_s), now_ns + nanoseconds(again_s)
+                self._pending[number] = _Pending(packet, type(body).__name__, done, deadline_ns, again_ns, timeout_s)
         if failed is not None:
             done(failed)
         else:
@@ -143,14 +137,13 @@ class ProxySession:
     """
 
     def __init__(
-        self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock
+        self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock, dial: Dialer
     ) -> None:
-        """Create an unconnected session; ``poke`` wakes the supervisor."""
+        """Connect; ``poke`` wakes the supervisor. Raises the dialer's errors."""
         self._handler = handler
         self._poke = poke
         self._clock = clock
-        self._end: TransportClient | None = None
-        self._same_clock = False
+        self.open = True  #: whether neither end has closed the session
         self._quiet = False  # closed by this end, so later arrivals are ignored
         self._up = False
         self._pinged_ns = 0
@@ -168,14 +161,11 @@ class ProxySession:
         self.closed_reason: str | None = None  #: why it ended, once it has
         self.receiver = 0  #: identity of the receiving thread
         self.look_ns = 0  #: when the supervisor next evaluates its state
-
-    # Set-up and end --------------------------------------------------------------------------------------------
-
-    def dial(self, dialer: Dialer) -> None:
-        """Connect. Raises the dialer's errors."""
-        self._end = dialer(self)
+        self._end = dial(self)  # last, because packets may arrive at once
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
+
+    # Set-up and end --------------------------------------------------------------------------------------------
 
     def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
         """Use the answer to Hello, sent at ``sent_ns``, as the first measurement of the clock offset.
@@ -185,60 +175,48 @@ class ProxySession:
         if welcome.clock and welcome.clock != clock_identity():
             self._same_clock = False
         if not self._same_clock:
-            self._take_offset(self._trips.add(sent_ns, welcome.now_ns, self._clock()))
+            self.offset_ns = self._trips.add(sent_ns, welcome.now_ns, self._clock()).ns
 
     def close(self, error: LinkError) -> None:
         """End the session; unanswered requests get ``error``."""
-        self._quiet = True
-        if self._end is not None:
-            self._end.close()
+        self._quiet, self.open = True, False
+        self._end.close()
         self.requests.fail(error)
-
-    @property
-    def open(self) -> bool:
-        """Whether neither end has closed the session."""
-        return self.closed_reason is None and not self._quiet
 
     @property
     def variants(self) -> bool:
         """Whether frames arrive in the requested form; see :class:`skyloop.transport.base.TransportClient`."""
-        return self._end is not None and self._end.variants
+        return self._end.variants
 
     @property
     def address(self) -> str:
         """Human-readable address of the proxy."""
-        return self._end.address if self._end is not None else "nowhere"
+        return self._end.address
 
     # Sending ---------------------------------------------------------------------------------------------------
 
     @property
     def transmit(self) -> Callable[[bytes], bool]:
         """The transport's own send function, without another layer, for frequent packets."""
-        assert self._end is not None
         return self._end.send
 
     def send(self, packet: bytes) -> bool:
         """Hand a packet to the transport; return False on failure."""
-        end = self._end
-        return end is not None and not self._quiet and end.send(packet)
+        return not self._quiet and self._end.send(packet)
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
         """Receive on the calling thread; see :meth:`skyloop.transport.base.TransportClient.lead`."""
-        end = self._end
-        return end is not None and not self._quiet and end.lead(ready, wake, timeout_s)
+        return not self._quiet and self._end.lead(ready, wake, timeout_s)
 
     @property
     def receiving(self) -> bool:
         """Whether the calling thread is the one that receives at present."""
-        return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
+        return self.receiver == threading.get_ident() or self._end.receiving
 
     def subscribe(self, topic: str, on: bool) -> None:
         """Subscribe to or unsubscribe from a topic. Video shared by several requests is subscribed to once."""
-        end = self._end
-        if end is None:
-            return
         if topic.startswith(_VIDEOS):
-            carrier = _carrier(topic, variants=end.variants)
+            carrier = _carrier(topic, variants=self.variants)
             users = self._video_users.setdefault(carrier, set())
             had_users = bool(users)
             (users.add if on else users.discard)(topic)
@@ -250,14 +228,11 @@ class ProxySession:
                 return
             if on:
                 self._expect(FeedbackRequest.parse(topic))
-        end.subscribe(topic, on)
+        self._end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
         """Repeat due requests, and ping the proxy if it is silent or its clock needs measuring."""
         self.requests.tick(now_ns)
-        end = self._end
-        if end is None:
-            return
         late_ns = self.monitor.late_ns  # silence after which the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
@@ -275,14 +250,13 @@ class ProxySession:
         may be older, or have no room for more forms. Consumers select their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
-        end = self._end
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns
-        if end is None or not self._feedback_watch.stalled(answers, now_ns):
+        if not self._feedback_watch.stalled(answers, now_ns):
             return
-        end.subscribe(self._feedback.topic, False)
+        self._end.subscribe(self._feedback.topic, False)
         self._only_plain = self._only_plain or not self._feedback.is_plain
         self._expect(PLAIN)
-        end.subscribe(FEEDBACK)
+        self._end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
         """Evaluate the link by the new feedback rate from now on."""
@@ -295,10 +269,7 @@ class ProxySession:
     def _ponged(self, answer: AnyReply | LinkError) -> None:
         self._pinged = False
         if isinstance(answer, Pong) and not self._same_clock:
-            self._take_offset(self._trips.add(answer.sent_ns, answer.now_ns, self._clock()))
-
-    def _take_offset(self, offset: Offset) -> None:
-        self.offset_ns = offset.ns
+            self.offset_ns = self._trips.add(answer.sent_ns, answer.now_ns, self._clock()).ns
 
     @property
     def uncertainty_ns(self) -> int:
@@ -342,7 +313,7 @@ class ProxySession:
         now_ns = self._clock()
         if self._quiet:
             return
-        if size_error(header, pixels.size):
+        if pixels.size != frame_size(header):
             self._malformed()
             return
         self.monitor.received_ns = now_ns
@@ -350,7 +321,7 @@ class ProxySession:
 
     def closed(self, reason: str) -> None:
         """Handle a connection closed by the transport; the supervisor reconnects."""
-        self.closed_reason = reason
+        self.closed_reason, self.open = reason, False
         self._poke()
 
     def _reply(self, reply: Reply, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
@@ -361,6 +332,12 @@ class ProxySession:
     def _malformed(self) -> None:
         self.monitor.malformed()
         self._poke()
+
+
+def frame_size(header: FrameHeader) -> int:
+    """Return how many bytes the frame announced by ``header`` must have."""
+    channels = CHANNELS.get(header.encoding)
+    return header.size if channels is None else header.width * header.height * channels
 
 
 def _carrier(topic: str, *, variants: bool) -> str:

@@ -106,15 +106,9 @@ def swarm(
 
 
 def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return the targets by name, in the order given. Pure.
+    """Return the targets by name, in the order given. Pure. For targets and errors see :func:`swarm`.
 
-    Args:
-        targets: As for :func:`swarm`.
-        running: Returns the names of running proxies; called only if there is a pattern.
-
-    Raises:
-        UsageError: If a target makes no sense or is named twice, or there is none.
-        UnknownNameError: If a pattern matches no running proxy.
+    ``running`` returns the names of running proxies; it is called only if there is a pattern.
     """
     chosen: dict[str, str] = {}
     counts: dict[str, int] = {}
@@ -150,11 +144,7 @@ def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[st
 
 
 def check_policy(on_error: str) -> None:
-    """Check a value of ``on_error``.
-
-    Raises:
-        UsageError: If it is unknown.
-    """
+    """Raise :class:`UsageError` for an unknown value of ``on_error``."""
     if on_error not in get_args(OnError):
         raise UsageError(f"on_error is {on_error!r} and must be one of {', '.join(map(repr, get_args(OnError)))}")
 
@@ -176,9 +166,9 @@ class Swarm:
     is a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same
     time (or hover, with ``on_exit``), including those set aside, even if some of them fail.
 
-    Commands return a dict with the result of the same command of :class:`Drone` for each name. They raise
-    :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not finite, and
-    :class:`ClosedError`.
+    Commands return a dict with the result of the same command of :class:`Drone` for each name. Methods that command,
+    read or wait raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not
+    finite, and :class:`ClosedError` once the swarm was closed.
     """
 
     def __init__(
@@ -188,15 +178,10 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """Adopt connected drones, which the swarm closes at its end.
+        """Adopt connected drones, by name, which the swarm closes at its end; see :func:`skyloop.swarm`.
 
-        Args:
-            drones: The drones by name.
-            on_error: What to do when some fail.
-            missing: Requested drones that could not be connected, with the reasons.
-
-        Raises:
-            UsageError: If there is no drone, or ``on_error`` is unknown.
+        ``missing`` are the requested drones that could not be connected, with the reasons. Raises :class:`UsageError`
+        if there is no drone, or ``on_error`` is unknown.
         """
         check_policy(on_error)
         if not drones:
@@ -276,10 +261,6 @@ class Swarm:
         Args:
             wait: Wait until each hovers.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
 
@@ -289,10 +270,6 @@ class Swarm:
         Args:
             wait: Wait until each has landed.
             timeout_s: How long to wait [s].
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
 
@@ -382,12 +359,7 @@ class Swarm:
         self.fail("go_to", errors)
 
     def return_to_start(
-        self,
-        height_m: float | None = None,
-        *,
-        land: bool | None = None,
-        wait: bool = True,
-        timeout_s: float = 180.0,
+        self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
         """Fly all active drones back to where each took off, all at the same time; see :meth:`Drone.return_to_start`.
 
@@ -454,7 +426,7 @@ class Swarm:
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
         # Wait a few milliseconds at most until every drone can send a set-point at once, so that all are sent together.
-        open_ns = max((drone._commands.open_ns for drone in ready.values()), default=0)
+        open_ns = max((drone._commands.schedule.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
@@ -486,10 +458,6 @@ class Swarm:
 
         Returns:
             Its results by name.
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
         self._check_open()
 
@@ -509,17 +477,9 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, AuthorityStatus]:
-        """Request the authority over all active drones.
+        """Request the authority over all active drones; return the status of each, by name.
 
-        Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: As for :meth:`Drone.request_authority`.
-            for_s: As for :meth:`Drone.request_authority`.
-            takeover: As for :meth:`Drone.request_authority`.
-            stay: As for :meth:`Drone.request_authority`.
-
-        Returns:
-            The status of each, by name.
+        Arguments are those of :meth:`Drone.request_authority`.
         """
         return self.each(
             lambda drone: drone.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay),
@@ -537,10 +497,6 @@ class Swarm:
 
         Args:
             max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
-
-        Raises:
-            SwarmError: Depending on ``on_error``.
-            ClosedError: If the swarm was closed.
         """
         self._check_open()
         found, errors = _try_all(self.active, lambda drone: drone.feedback(max_age_s=max_age_s))
@@ -654,13 +610,7 @@ class Swarm:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self) -> dict[str, Exception]:
-        """End the block: land all flying drones at the same time, and close.
-
-        Idempotent.
-
-        Returns:
-            The exceptions, by name of the drone.
-        """
+        """End the block: land all flying drones at the same time, and close. Return the errors by name. Idempotent."""
         if self._closed:
             return {}
         self._closed = True
@@ -784,14 +734,11 @@ def _not_sent(drone: Drone) -> LinkError:
 def in_parallel(
     jobs: Mapping[str, Callable[[], T]], interrupted: threading.Event | None = None
 ) -> tuple[dict[str, T], dict[str, Exception]]:
-    """Run all jobs at the same time, each in its own thread, and wait for the last.
+    """Run all jobs, by name, at the same time, each in its own thread, and wait for the last.
 
-    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt ends the jobs'
-    waits for commands, see :data:`skyloop.client.commands.cancelled`; their other work ends normally.
-
-    Args:
-        jobs: The jobs by name.
-        interrupted: Once set, it also ends their waits.
+    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or
+    ``interrupted`` once set, ends the jobs' waits for commands, see :data:`skyloop.client.commands.cancelled`; their
+    other work ends normally.
 
     Returns:
         The result of each job, and the :class:`SkyloopError` that each raised, both by name. Any other exception is

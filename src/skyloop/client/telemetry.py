@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
-from types import TracebackType
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
@@ -57,12 +56,6 @@ class LinkStatus:
     remedy: str = ""  #: what to do about the vehicle's link while it is not up
 
 
-class Closable(Protocol):
-    """A resource that ends with the drone."""
-
-    def close(self) -> None: ...
-
-
 class Mailboxes:
     """Mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
 
@@ -106,9 +99,7 @@ class Mailboxes:
             fill(channel.into(self.results))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._filling.close()
 
     @property
@@ -202,7 +193,7 @@ class ClientState:
         self.app = app
         self.scheduler = scheduler
         self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
-        self.to_close: list[Closable] = []  #: resources that end with the drone
+        self.to_close: list[Callable[[], None]] = []  #: end resources that end with the drone
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback arrived, on our clock
@@ -245,13 +236,13 @@ class ClientState:
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
-    def closing(self, mailbox: Closable) -> Iterator[None]:
+    def closing(self, mailbox: Mailbox[Any] | ResultMailbox) -> Iterator[None]:
         """Close ``mailbox``, which wakes its consumer, if the drone is closed during the block."""
-        self.to_close.append(mailbox)
+        self.to_close.append(mailbox.close)
         try:
             yield
         finally:
-            self.to_close.remove(mailbox)
+            self.to_close.remove(mailbox.close)
 
     def forget(self, listener: Listener[Any]) -> None:
         """Forget a cancelled listener."""
@@ -399,9 +390,11 @@ class SessionSamples:
     def _event(self, event: Event, now_ns: int) -> None:
         """Store and publish an event."""
         self._state.recent.append(event)
-        if event.kind is EventKind.PARAMETER_CHANGED and event.data.get("app_id") != self._commands.app_id:
-            self._restorer.overwritten(str(event.data.get("name")))
-        self._commands.event(event, now_ns)
+        if event.kind is EventKind.PARAMETER_CHANGED:
+            if event.data.get("app_id") != self._commands.app_id:
+                self._restorer.overwritten(str(event.data.get("name")))
+        elif event.kind.startswith("authority_"):
+            self._commands.event(event, now_ns)
         self._state.on_event.publish(event)
         self._state.notifier.notify()
 
@@ -431,11 +424,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition, and its human-readable name.
-
-    Raises:
-        UnknownNameError: If there is no flight state of this name.
-    """
+    """Return the predicate for a condition and its readable name; :class:`UnknownNameError` for an unknown state."""
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")
         return wanted, "as wanted" if name == "<lambda>" else name

@@ -13,7 +13,7 @@ import numpy as np
 
 from skyloop.client.channels import Channel, checked_age
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame, SmallArrival
+from skyloop.client.frame import Arrival, FeedbackHistory, Frame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats, StallWatch
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UnknownNameError, UnsupportedError, UsageError
@@ -83,7 +83,9 @@ class VideoChannel(Channel[Arrival]):
         self.undecodable = 0
         self.too_old = 0  #: number of frames rejected because of a consumer's ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
-        self.filter = FrameFilter(self.request)  #: selects this request's frames from the plain ones
+        chosen = self.request.part is not None or self.request.max_fps is not None
+        #: Selects this request's frames from the plain ones; None: all of them.
+        self.filter = FrameFilter(self.request) if chosen else None
         self._read: Arrival | None = None  # the last result of next_frame()
         self._connection = connection
         self._history = history
@@ -119,11 +121,8 @@ class VideoChannel(Channel[Arrival]):
         last = counter.last_seq
         if last is not None and header.seq <= last:
             return  # a duplicate, or overtaken
-        offset_ns, scale = self._connection.offset_ns, self.request.scale
-        if as_asked or scale == 1.0:
-            arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock)
-        else:
-            arrival = SmallArrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
+        offset_ns, scale = self._connection.offset_ns, 1.0 if as_asked else self.request.scale
+        arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
         # Consumers come first, then the statistics. The previous frame is released last, because returning its memory
         # to the proxy takes longer than everything else here.
         before, self.newest = self.newest, arrival
@@ -290,32 +289,15 @@ class VideoChannels:
         self._history = history
         self._making = threading.RLock()  # so that two threads that request the same channel get the same one
 
-    def channel(
-        self,
-        camera: str | None = None,
-        *,
-        encoding: VideoEncoding | None = None,
-        quality: int | None = None,
-        max_fps: float | None = None,
-        scale: float = 1.0,
-        part: tuple[int, int] | None = None,
-        kbit_s: int | None = None,
-        max_age_s: float | None = None,
-    ) -> VideoChannel:
+    def channel(self, camera: str | None = None, **how: Unpack[VideoOptions]) -> VideoChannel:
         """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
-        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
-
-        Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for another encoding than JPEG.
-            MissingExtraError: If H.264 is requested and PyAV is not installed.
-            ClosedError: If the drone was closed.
+        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`. Raises also
+        :class:`MissingExtraError` if H.264 is requested and PyAV is not installed.
         """
         self._connection.check_open()
-        checked_age(max_age_s)
-        channels = self.channels
+        checked_age(how.get("max_age_s"))
+        channels, encoding, quality = self.channels, how.get("encoding") or "jpeg", how.get("quality")
         if not channels:
             raise UnsupportedError("this vehicle has no camera")
         channel = next(iter(channels.values())) if camera is None else channels.get(camera)
@@ -327,13 +309,13 @@ class VideoChannels:
             require_pyav(_PURPOSE)
         request = VideoRequest(
             channel.camera.name,
-            encoding="jpeg" if encoding is None else encoding,
+            encoding=encoding,
             quality=DEFAULT_QUALITY if quality is None else quality,
-            max_fps=max_fps,
-            scale=scale,
-            part=part,
-            kbit_s=kbit_s,
-            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
+            max_fps=how.get("max_fps"),
+            scale=how.get("scale", 1.0),
+            part=how.get("part"),
+            kbit_s=how.get("kbit_s"),
+            subscriber=self.subscriber if encoding == "h264" and how.get("kbit_s") is None else "",
         )
         return channel if request == channel.request else self.made(channel.camera, request)
 
@@ -392,8 +374,8 @@ class VideoChannels:
                 channel.receive(header, pixels, now_ns, as_asked=True)
             return
         for channel in tuple(self.variants.values()):
-            mine = channel.subscribed and channel.camera.name == header.camera
-            if mine and channel.filter.wants(header.seq, header.captured_ns):
+            mine, chosen = channel.subscribed and channel.camera.name == header.camera, channel.filter
+            if mine and (chosen is None or chosen.wants(header.seq, header.captured_ns)):
                 channel.receive(header, pixels, now_ns, as_asked=False)
 
     def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)

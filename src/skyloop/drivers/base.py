@@ -167,23 +167,15 @@ AHEAD_NS: Final = nanoseconds(0.05)  #: how far in the future a pose may be: acc
 class ExternalPose:
     """A vehicle's pose as measured from outside, for example by motion capture.
 
-    Args:
-        position_m: Position of the body's origin in world axes, x east, y north, z up [m].
-        quaternion: Rotation (x, y, z, w) from body axes (x forward, y left, z up) to world axes.
-        captured_ns: Time of the measurement, on this host's monotonic clock.
-        position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
-        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
-
-    Raises:
-        UsageError: A number is not finite, a standard deviation is negative, or the quaternion's length differs from 1
-            by more than 0.001.
+    Raises :class:`UsageError` if a number is not finite, a standard deviation is negative, or the quaternion's length
+    differs from 1 by more than 0.001.
     """
 
-    position_m: Vector
-    quaternion: tuple[float, float, float, float]
-    captured_ns: int
-    position_std_m: float | None = None
-    attitude_std_rad: float | None = None
+    position_m: Vector  #: position of the body's origin in world axes, x east, y north, z up [m]
+    quaternion: tuple[float, float, float, float]  #: rotation (x, y, z, w) from body (forward, left, up) to world axes
+    captured_ns: int  #: time of the measurement, on this host's monotonic clock
+    position_std_m: float | None = None  #: standard deviation of the position [m], 0 or more; None if unknown
+    attitude_std_rad: float | None = None  #: standard deviation of the orientation [rad], 0 or more; None if unknown
 
     def __post_init__(self) -> None:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
@@ -191,11 +183,8 @@ class ExternalPose:
     def bounded(self, now_ns: int) -> ExternalPose:
         """Return the pose with its time limited to the present, as drivers require.
 
-        Args:
-            now_ns: The present time, on this host's monotonic clock.
-
-        Raises:
-            DriverError: Its time is more than 50 ms ahead: the clock is wrong, and all later poses would look old.
+        Raises :class:`DriverError` if it is more than 50 ms ahead: the clock is wrong, and all later poses would look
+        old.
         """
         ahead_ns = self.captured_ns - now_ns
         if ahead_ns > AHEAD_NS:
@@ -411,15 +400,7 @@ class Driver(ABC):
 
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise an error if the URI has an unknown option.
-
-    Args:
-        uri: The vehicle's address.
-        known: Every option that the driver reads.
-
-    Raises:
-        UnknownNameError: An option is not in ``known``; the message names the first.
-    """
+    """Raise :class:`UnknownNameError` for the first of the URI's options that is not in ``known``."""
     for name in uri.options:
         if name not in known:
             raise UnknownNameError(f"option of {uri.scheme}://", name, known)

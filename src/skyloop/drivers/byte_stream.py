@@ -42,11 +42,7 @@ class Rank(IntEnum):
 
 
 #: Maximum lag of the line at which packets of a rank are still sent [ns].
-_PATIENCE_NS: Final = {
-    Rank.SETPOINT: nanoseconds(0.1),
-    Rank.QUERY: nanoseconds(0.06),
-    Rank.POSE: nanoseconds(0.02),
-}
+_PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(0.06), Rank.POSE: nanoseconds(0.02)}
 
 
 class LinePace:
@@ -116,17 +112,12 @@ class ByteStream(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return the received bytes, possibly none.
-
-        Raises:
-            OSError: The connection has ended.
-        """
+        """Return the received bytes, possibly none. Raises ``OSError`` if the connection has ended."""
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
         """Send a packet, or drop it if there is no room or the line lags. Never waits.
 
-        Raises:
-            OSError: The packet can't be sent, or no whole packet could be sent for :data:`STUCK_NS`.
+        Raises ``OSError`` if it can't be sent, or no whole packet could be sent for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
@@ -210,8 +201,7 @@ class ByteStream(ABC):
 class TcpStream(ByteStream):
     """A TCP connection to a numeric address, because a name look-up would block. The server may not be serving yet.
 
-    Raises:
-        OSError: The connection was not made within :data:`CONNECT_S`.
+    Raises ``OSError`` unless the connection is made within :data:`CONNECT_S`.
     """
 
     def __init__(self, host: str, port: int, clock: Clock = monotonic_ns) -> None:
@@ -261,9 +251,7 @@ class TcpStream(ByteStream):
 class SerialStream(ByteStream):
     """A serial port, opened with pyserial for exclusive use and with an empty output buffer.
 
-    Raises:
-        OSError: The port can't be opened.
-        MissingExtraError: pyserial is not installed.
+    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` without pyserial.
     """
 
     def __init__(self, path: str, baud: int, what: str, extra: str, clock: Clock = monotonic_ns) -> None:

@@ -195,9 +195,8 @@ class Inspector:
     def inspect(self, data: bytes) -> Unit | None:
         """Inspect the next access unit, in Annex B format.
 
-        Returns:
-            The unit; None if it holds no picture, or if its headers are damaged or unknown. In that case, the next unit
-            is marked as following a gap.
+        Returns None if it holds no picture, or if its headers are damaged or unknown; then the next unit is marked as
+        following a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}

@@ -16,8 +16,7 @@ import numpy as np
 
 from skyloop.clock import Clock, LiveClock, nanoseconds
 from skyloop.drivers.h264 import Inspector, Unit
-from skyloop.drivers.live_frames import Coded
-from skyloop.drivers.live_video import Decoded
+from skyloop.drivers.live_video import Coded, Decoded
 from skyloop.errors import MissingExtraError, UnsupportedError
 from skyloop.messages.frame import H264
 from skyloop.pyav import limit_memory, new_decoder
@@ -66,10 +65,7 @@ class ContainerStream:
 
     Args:
         name: An address or path for FFmpeg, or a file's content.
-        number: Number of the connection.
-        clock: A monotonic clock [ns].
         format_name: FFmpeg's name of the format; None: detect it.
-        options: Options for FFmpeg.
         open_s: Time limit for connecting, the handshake and finding out the size of the pictures [s]; a device that
             hangs takes longer.
         read_s: Time limit for the next picture [s]. FFmpeg can't be interrupted, so :meth:`read` may take this long.
@@ -229,9 +225,7 @@ class LiveDecoder:
     """
 
     def __init__(
-        self,
-        on_whole: Callable[[Coded], None] = lambda _: None,
-        on_forgiving: Callable[[str], None] = lambda _: None,
+        self, on_whole: Callable[[Coded], None] = lambda _: None, on_forgiving: Callable[[str], None] = lambda _: None
     ) -> None:
         self.waited = 0
         self.damaged = 0

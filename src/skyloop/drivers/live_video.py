@@ -1,13 +1,14 @@
-"""Receive a vehicle's live video, decode it, and show the newest picture.
+"""Receive a vehicle's live video, decode it, and show the newest picture; forward H.264 undecoded.
 
 One thread reads frames from the socket as they arrive, so that pictures don't age in a kernel buffer, and keeps
-reconnecting. Another one decodes the frames that are wanted. Between them, the
-:class:`~skyloop.drivers.live_frames.FrameBacklog` decides which frames to drop when decoding is late.
+reconnecting. Another one decodes the frames that are wanted. Between them, the :class:`FrameBacklog` decides which
+frames to drop when decoding is late.
 """
 
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -18,13 +19,73 @@ from numpy.typing import NDArray
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.drivers.base import Sink
-from skyloop.drivers.live_frames import Coded, FrameBacklog
+from skyloop.drivers.h264 import Unit
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
+from skyloop.messages.frame import Chain
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
 REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
+LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
+KEYLESS: Final = 600  #: number of pictures without a key picture after which a stream is reported as not forwardable
+MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
+
+
+@dataclass(frozen=True, slots=True)
+class Coded:
+    """An encoded frame on arrival."""
+
+    data: object  #: input for the vehicle's decoder
+    is_key: bool  #: whether decoding can start here
+    captured_ns: int  #: capture time, on this host's clock
+    arrived_ns: int
+    connection: int  #: increases with each connection; frames never refer to those of another connection
+
+
+class FrameBacklog:
+    """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest wins.
+
+    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, frames
+    before the newest key frame are dropped; the rest must all be decoded, as each refers to the previous one, but only
+    the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
+    subscriber gets an image at once.
+
+    ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
+    """
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        self._frames: deque[tuple[Coded, bool]] = deque()  # frames, and whether each was wanted on arrival
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def put(self, frame: Coded, *, wanted: bool) -> None:
+        """Add a received frame."""
+        if frame.is_key and not wanted:
+            self._drop(len(self._frames))
+        elif len(self._frames) == MAX_FRAMES:
+            self._drop(1)  # frames that refer to it are lost up to the next key frame, as after any loss
+        self._frames.append((frame, wanted))
+
+    def take(self, now_ns: int) -> tuple[Coded, bool]:
+        """Remove the frame to decode next; return it and whether to show it. Raises ``IndexError`` if there is none."""
+        if self._late(now_ns):
+            keys = [n for n, (frame, _) in enumerate(self._frames) if frame.is_key]
+            self._drop(keys[-1] if keys else 0)
+        show = len(self._frames) == 1 or not self._late(now_ns)
+        frame, wanted = self._frames.popleft()
+        self.skipped += wanted and not show
+        return frame, show
+
+    def _late(self, now_ns: int) -> bool:
+        return now_ns - self._frames[0][0].arrived_ns > LATE_NS
+
+    def _drop(self, count: int) -> None:
+        for _ in range(count):
+            _, wanted = self._frames.popleft()
+            self.skipped += wanted
 
 
 class Decoded(NamedTuple):
@@ -47,12 +108,9 @@ class Stream(Protocol):
         """Number of bytes outside whole frames."""
 
     def read(self) -> list[Coded]:
-        """Return the received frames.
+        """Return the received frames. Raises ``OSError`` if the connection is lost.
 
         Should return within a tenth of a second: :meth:`LiveVideo.stop` waits for it.
-
-        Raises:
-            OSError: The connection is lost.
         """
 
     def close(self) -> None: ...
@@ -73,17 +131,9 @@ class Decoder(Protocol):
         """Forget the stream so far, which the next frame does not continue."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame. Whatever it contains, no other errors are raised.
+        """Decode a frame; return its picture, or None if there is none or it is not wanted (``show``).
 
-        Args:
-            coded: The frame.
-            show: Whether its picture is wanted.
-
-        Returns:
-            The picture; None if there is none or it is not wanted.
-
-        Raises:
-            UnsupportedError: The codec is not supported.
+        Raises :class:`UnsupportedError` for an unsupported codec, and nothing else, whatever the frame contains.
         """
 
 
@@ -138,11 +188,7 @@ class VideoCounters:
     reconnects: int = 0  #: connections that delivered frames, not counting the first
 
     def telemetry(self, of: str) -> dict[str, Value]:
-        """Return the counters for feedback's ``native``.
-
-        Args:
-            of: Prefix of the names, followed by a dot.
-        """
+        """Return the counters for feedback's ``native``; ``of`` is the prefix of their names, without the dot."""
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
 
@@ -343,3 +389,101 @@ class LiveVideo:
     def _emit(self, event: VideoEvent, text: str) -> None:
         if not self._stop.is_set():
             self._on_event(event, text)
+
+
+class StreamRelay:
+    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
+
+    Whether pictures are also decoded makes no difference. Not thread-safe.
+    """
+
+    def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
+        self._sink = sink
+        self._intrinsics = intrinsics
+        self._chain = Chain()
+        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
+
+    def wanted(self, camera: str) -> bool:
+        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
+        wanted = self._sink.wants_stream(camera)
+        if not wanted:
+            self.restart()
+        return wanted
+
+    def restart(self) -> None:
+        """Restart with the next key picture."""
+        self._source = None
+
+    def take(
+        self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
+    ) -> bool:
+        """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
+
+        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the pictures of the connection, so those
+        left out cause gaps. ``picture``: False if there are only parameters, which are not forwarded.
+        """
+        if not self.wanted(camera):
+            return False
+        source = camera, connection
+        if unit.after_gap or source != self._source:
+            self._chain.restart()
+        self._source = source
+        if not self._chain.follows(number, key=unit.is_key) or not picture:
+            return False
+        self._sink.stream(
+            camera,
+            unit.data,
+            captured_ns,
+            width=unit.width,
+            height=unit.height,
+            key=unit.is_key,
+            intrinsics=self._intrinsics(camera, unit.width, unit.height),
+        )
+        return True
+
+
+class CheckedRelay:
+    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
+
+    Not thread-safe.
+    """
+
+    def __init__(self, relay: StreamRelay, sink: Sink, camera: str, where: str) -> None:
+        self._relay = relay
+        self._sink = sink
+        self._camera = camera
+        self._where = where
+        self._refused = (-1, "")  # number of the connection, and the reason
+        self._waited = 0
+        self._reported = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the stream is wanted."""
+        return self._relay.wanted(self._camera)
+
+    def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
+        """Forward an undamaged picture; see :meth:`StreamRelay.take`.
+
+        ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded, for the rest of the
+        connection; empty if it can.
+        """
+        if not self.wanted:
+            return
+        if reason:
+            self._refused = connection, reason
+        if self._refused[0] == connection:
+            self._report(self._refused[1])
+            return
+        taken = unit is not None and self._relay.take(
+            self._camera, unit, captured_ns, number=number, connection=connection
+        )
+        self._waited = 0 if taken else self._waited + 1
+        if self._waited == KEYLESS:
+            self._report(f"{KEYLESS} pictures without a key picture (IDR) with parameters: configure the encoder")
+
+    def _report(self, why: str) -> None:
+        if why != self._reported:
+            self._reported = why
+            text = f"{self._where}: {why}: only decoded frames are available, not the original stream"
+            self._sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=self._where)

@@ -7,13 +7,14 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import (
     Encoding,
     EventKind,
@@ -25,30 +26,18 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-
-_CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+from skyloop.messages.fields import CHANNELS
 
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A frame as published by the driver.
-
-    Args:
-        camera: Name of the camera.
-        pixels: A copy, uint8, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if the frame was
-            malformed or pixels are not kept.
-        captured_ns: Capture time as passed by the driver, on this host's monotonic clock.
-        arrived_ns: Time of the call, on the same clock.
-        width: Width [px].
-        height: Height [px].
-        encoding: Encoding of the pixels.
-        intrinsics: Intrinsics as passed by the driver.
-    """
+    """A frame, with the arguments of :meth:`skyloop.drivers.base.Sink.frame`."""
 
     camera: str
+    #: A copy, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if malformed or not kept.
     pixels: NDArray[np.uint8]
     captured_ns: int
-    arrived_ns: int
+    arrived_ns: int  #: time of the call, on this host's monotonic clock
     width: int
     height: int
     encoding: Encoding
@@ -66,16 +55,6 @@ class SeenPicture:
     height: int
     key: bool
     intrinsics: Intrinsics | None
-
-
-@dataclass(frozen=True, slots=True)
-class SeenEvent:
-    """An event, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
-
-    kind: EventKind
-    text: str
-    severity: Severity
-    data: dict[str, Value] = field(default_factory=dict)
 
 
 class RecordingSink:
@@ -100,7 +79,7 @@ class RecordingSink:
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
         self.remedy = ""  #: the remedy reported with the newest link state
-        self.events: deque[SeenEvent] = deque(maxlen=keep)
+        self.events: deque[VehicleEvent] = deque(maxlen=keep)
         self.problems: list[str] = []
         self.calls = 0
         self.feedback_count = 0
@@ -185,7 +164,7 @@ class RecordingSink:
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
         """Keep an event."""
         with self._changed:
-            self.events.append(SeenEvent(EventKind(kind), text, Severity(severity), data))
+            self.events.append(VehicleEvent(EventKind(kind), text, Severity(severity), data))
             self._notify()
 
     # Called by the test --------------------------------------------------------------------------------------------
@@ -201,14 +180,9 @@ class RecordingSink:
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until a condition holds.
+        """Wait until a condition holds; return False if it does not within ``timeout_s`` [s].
 
-        Args:
-            condition: Called after each of the driver's calls, with the sink's lock held.
-            timeout_s: How long to wait [s].
-
-        Returns:
-            Whether the condition held; False after the time-out.
+        ``condition`` is called after each of the driver's calls, with the sink's lock held.
         """
         end = time.monotonic() + timeout_s
         with self._changed:
@@ -240,7 +214,7 @@ class RecordingSink:
         if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or not pixels.flags.c_contiguous:
             self.problems.append(f"frame of {camera}: pixels must be a C-contiguous array of uint8")
             return empty
-        channels = _CHANNELS.get(encoding)
+        channels = CHANNELS.get(encoding)
         if channels is None:
             if bytes(pixels.reshape(-1)[:2]) != b"\xff\xd8":
                 self.problems.append(f"frame of {camera}: not a JPEG file")
@@ -269,14 +243,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """Check a sample for numbers that are not finite, or so large that they must have the wrong unit.
-
-    Args:
-        feedback: The sample.
-
-    Returns:
-        Descriptions of the problems; empty if there are none.
-    """
+    """Describe a sample's numbers that are not finite, or so large that they must have the wrong unit."""
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
         value = getattr(feedback, name)
@@ -303,15 +270,7 @@ _TYPES: Final[dict[ParameterType, tuple[type, ...]]] = {
 
 
 def mismatch(parameter: Parameter, value: Value) -> str:
-    """Return why a value does not fit a parameter's description.
-
-    Args:
-        parameter: The description: type, choices, range.
-        value: The value to check.
-
-    Returns:
-        A predicate for a sentence about the value; empty if it fits.
-    """
+    """Return why a value does not fit a parameter's type, choices or range, as a predicate; empty if it fits."""
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
         return f"is not of type {parameter.type}"

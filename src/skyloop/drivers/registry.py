@@ -25,10 +25,7 @@ def known_schemes() -> list[str]:
 
 
 def driver_class(scheme: str) -> type[Driver]:
-    """Import and return the driver class for a scheme.
-
-    Args:
-        scheme: The scheme, for example ``ardrone``.
+    """Import and return the driver class for a scheme, for example ``ardrone``.
 
     Raises:
         UnknownNameError: No installed package claims the scheme.
@@ -52,14 +49,8 @@ def driver_class(scheme: str) -> type[Driver]:
 def make_driver(uri: str | VehicleUri) -> Driver:
     """Return an unopened driver for a vehicle's address.
 
-    Args:
-        uri: The address, as text or parsed.
-
-    Raises:
-        UsageError: The address or one of its options makes no sense.
-        UnknownNameError: No installed package claims the scheme.
-        DriverError: Two packages claim the scheme, or the class can't be loaded.
-        MissingExtraError: A package that the driver needs is not installed.
+    Raises the errors of :func:`driver_class`, and :class:`UsageError` if the address or one of its options makes no
+    sense.
     """
     parsed = parse_uri(uri) if isinstance(uri, str) else uri
     return driver_class(parsed.scheme)(parsed)

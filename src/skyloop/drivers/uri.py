@@ -22,28 +22,21 @@ class VehicleUri:
 
     ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles don't contain users, passwords or keys (see
     ``skyloop.address``). Only code that opens the vehicle reads them, with :meth:`reveal_place` and :meth:`reveal`.
-
-    Attributes:
-        scheme: The driver's name.
-        place: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
-        options: Names and values as given, percent-decoded.
     """
 
     __slots__ = ("_given", "_secrets", "options", "place", "scheme")
 
     def __init__(self, scheme: str, place: str = "", options: Mapping[str, str] | None = None, text: str = "") -> None:
-        """Store an address.
+        """Store an address: the driver's name, a host, a path or nothing, and options by name.
 
-        Args:
-            scheme: The driver's name.
-            place: A host, a path, or nothing.
-            options: Options by name.
-            text: The address as given; empty if it is built in code.
+        ``text`` is the address as given; empty if it is built in code.
         """
         given = dict(options or {})
         broken = is_broken(given)
-        self.scheme: Final = scheme
+        self.scheme: Final = scheme  #: the driver's name
+        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
         self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
+        #: Names and values as given, percent-decoded.
         self.options: Final[Mapping[str, str]] = {
             shown_name(name): without_secrets(value, name, broken=broken) if value else value
             for name, value in given.items()
@@ -128,17 +121,7 @@ class VehicleUri:
         return value
 
     def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
-        """Return an option as a whole number within a range.
-
-        Args:
-            option: Name of the option.
-            default: Returned if the option is not given.
-            minimum: Smallest allowed value.
-            maximum: Largest allowed value.
-
-        Raises:
-            UsageError: The option is not a whole number within the range.
-        """
+        """Return an option as a whole number within a range; arguments and errors are those of :meth:`number`."""
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
             raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
@@ -147,12 +130,7 @@ class VehicleUri:
     def flag(self, option: str, default: bool = False) -> bool:
         """Return an option as a bool: ``1``, ``true``, ``yes`` or the bare name; ``0``, ``false`` or ``no``.
 
-        Args:
-            option: Name of the option.
-            default: Returned if the option is not given.
-
-        Raises:
-            UsageError: The option has any other value.
+        Raises :class:`UsageError` for any other value. ``default`` is returned if the option is not given.
         """
         given = self.options.get(option)
         if given is None:
@@ -166,9 +144,8 @@ class VehicleUri:
 def host_and_port(text: str) -> tuple[str, int] | None:
     """Return a host and its port; None for anything else.
 
-    Args:
-        text: For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an
-            IPv6 address is in brackets, which are not part of the host.
+    For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an IPv6
+    address is in brackets, which are not part of the host.
     """
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 1 <= int(port) <= 65_535:
@@ -183,13 +160,9 @@ def host_and_port(text: str) -> tuple[str, int] | None:
 
 
 def parse_uri(text: str) -> VehicleUri:
-    """Parse a vehicle's address.
+    """Parse a vehicle's address, such as ``ardrone://192.168.1.1?camera=front``, which may be percent-encoded.
 
-    Args:
-        text: For example ``ardrone://192.168.1.1?camera=front``. Place and options may be percent-encoded.
-
-    Raises:
-        UsageError: The text has no scheme with ``://``, or gives an option twice.
+    Raises :class:`UsageError` if the text has no scheme with ``://``, or gives an option twice.
     """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):

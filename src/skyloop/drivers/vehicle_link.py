@@ -12,6 +12,7 @@ import socket
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from functools import partial
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
@@ -42,22 +43,19 @@ class Readable(Protocol):
 class NameLookup:
     """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
 
-    It handles one host at a time. Not thread-safe.
-
-    Args:
-        family: Address family of the result.
-        wait_s: How long :meth:`address` may block [s]; 0 on a thread that also serves others.
+    It handles one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
+    that also serves others.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
         self._family = family
         self._wait_s = wait_s
-        self._asking: _PendingLookup | None = None
+        self._asking: Future[str] | None = None
 
     @property
     def answered(self) -> bool:
         """Whether a pending look-up has finished, so that it is worth calling :meth:`address` again."""
-        return self._asking is not None and self._asking.answered.is_set()
+        return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
         """Return a host's first address. Blocks for at most ``wait_s``."""
@@ -66,31 +64,23 @@ class NameLookup:
         except ValueError:
             pass
         if self._asking is None:
-            self._asking = _PendingLookup(host, self._family)
+            self._asking = Future()
+            resolve = partial(_resolve, self._asking, host, self._family)
+            threading.Thread(target=resolve, name="skyloop-lookup", daemon=True).start()
         question = self._asking
-        if not question.answered.wait(self._wait_s):
+        if not wait([question], self._wait_s).done:
             raise OSError(errno.ETIMEDOUT, f"the name {host} is still being looked up")
         self._asking = None
-        if isinstance(question.answer, OSError):
-            raise question.answer
-        return question.answer
+        return question.result()
 
 
-class _PendingLookup:
-    def __init__(self, host: str, family: socket.AddressFamily) -> None:
-        self.answered = threading.Event()
-        self.answer: str | OSError = ""
-        threading.Thread(target=self._resolve, args=(host, family), name="skyloop-lookup", daemon=True).start()
-
-    def _resolve(self, host: str, family: socket.AddressFamily) -> None:
-        try:
-            self.answer = str(socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)[0][4][0])
-        except OSError as error:
-            self.answer = error
-        except UnicodeError:  # a label that is too long
-            self.answer = OSError(errno.EINVAL, f"{host!r:.80} is not a valid host name")
-        finally:
-            self.answered.set()
+def _resolve(question: Future[str], host: str, family: socket.AddressFamily) -> None:
+    try:
+        question.set_result(str(socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)[0][4][0]))
+    except UnicodeError:  # a label that is too long
+        question.set_exception(OSError(errno.EINVAL, f"{host!r:.80} is not a valid host name"))
+    except Exception as error:  # noqa: BLE001  (raised where the answer is awaited)
+        question.set_exception(error)
 
 
 class VehicleLink(ABC, Generic[S]):
@@ -199,8 +189,7 @@ class VehicleLink(ABC, Generic[S]):
     def _open_sockets(self) -> None:
         """Replace the sockets with new ones. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: They can't be opened; the link retries.
+        Raises ``OSError`` if they can't be opened; the link retries.
         """
 
     @abstractmethod
@@ -358,16 +347,14 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
     def _connect(self) -> C:
         """Open a connection. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: It can't be opened; the link retries.
+        Raises ``OSError`` if it can't be opened; the link retries.
         """
 
     @abstractmethod
     def _read(self, connection: C) -> None:
         """Pass received data to the session. On the link's thread, with the lock free.
 
-        Raises:
-            OSError: The connection has ended.
+        Raises ``OSError`` if the connection has ended.
         """
 
     def _on_end(self, connection: C) -> None:

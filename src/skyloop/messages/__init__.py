@@ -4,158 +4,87 @@ SI units and radians; body axes x forward, y left, z up; world axes x east, y no
 integer nanoseconds on the proxy's monotonic clock.
 """
 
-from skyloop.messages.codec import Kind, Sample, decode, encode
-from skyloop.messages.command import (
-    ACTION_NAMES,
-    Action,
-    AnyAction,
-    Applied,
-    Attitude,
-    Command,
-    EmergencyStop,
-    Fate,
-    Hover,
-    Idle,
-    Land,
-    Outcome,
-    Position,
-    ResetEmergency,
-    ReturnToStart,
-    Takeoff,
-    VehiclePose,
-    Velocity,
-)
-from skyloop.messages.config import (
-    DEFAULT_PRIORITY,
-    HIGHEST_PRIORITY,
-    LONGEST_TERM_S,
-    LOWEST_PRIORITY,
-    AnswerTakeover,
-    AnyReply,
-    AnyRequest,
-    AuthorityGranted,
-    AuthorityQueued,
-    Capabilities,
-    Done,
-    GetParameter,
-    GetStatistics,
-    Hello,
-    JoinProcessor,
-    ListParameters,
-    ParameterPage,
-    ParameterValue,
-    Ping,
-    Pong,
-    Refused,
-    ReleaseAuthority,
-    Reply,
-    Request,
-    RequestAuthority,
-    SetParameter,
-    Statistics,
-    Welcome,
-)
-from skyloop.messages.feedback import Event, Feedback, Overview, VehicleOverview
-from skyloop.messages.fields import (
-    Encoding,
-    EventKind,
-    Failsafe,
-    FlightState,
-    LinkState,
-    Refusal,
-    ReturnPhase,
-    Role,
-    Severity,
-    Takeover,
-    Value,
-    Vector,
-)
-from skyloop.messages.frame import CameraInfo, EncodedFrame, FrameHeader, Intrinsics, StreamReport
-from skyloop.messages.parameter import Parameter, ParameterType
-from skyloop.messages.relayed import Annotation, LogEntry, Points, Polyline, ProcessorResult, ProcessorShare, Text
-from skyloop.messages.subscription import FeedbackRequest, VideoRequest
+from skyloop.messages.codec import Kind as Kind
+from skyloop.messages.codec import Sample as Sample
+from skyloop.messages.codec import decode as decode
+from skyloop.messages.codec import encode as encode
+from skyloop.messages.command import ACTION_NAMES as ACTION_NAMES
+from skyloop.messages.command import Action as Action
+from skyloop.messages.command import AnyAction as AnyAction
+from skyloop.messages.command import Applied as Applied
+from skyloop.messages.command import Attitude as Attitude
+from skyloop.messages.command import Command as Command
+from skyloop.messages.command import EmergencyStop as EmergencyStop
+from skyloop.messages.command import Fate as Fate
+from skyloop.messages.command import Hover as Hover
+from skyloop.messages.command import Idle as Idle
+from skyloop.messages.command import Land as Land
+from skyloop.messages.command import Outcome as Outcome
+from skyloop.messages.command import Position as Position
+from skyloop.messages.command import ResetEmergency as ResetEmergency
+from skyloop.messages.command import ReturnToStart as ReturnToStart
+from skyloop.messages.command import Takeoff as Takeoff
+from skyloop.messages.command import VehiclePose as VehiclePose
+from skyloop.messages.command import Velocity as Velocity
+from skyloop.messages.config import DEFAULT_PRIORITY as DEFAULT_PRIORITY
+from skyloop.messages.config import HIGHEST_PRIORITY as HIGHEST_PRIORITY
+from skyloop.messages.config import LONGEST_TERM_S as LONGEST_TERM_S
+from skyloop.messages.config import LOWEST_PRIORITY as LOWEST_PRIORITY
+from skyloop.messages.config import AnswerTakeover as AnswerTakeover
+from skyloop.messages.config import AnyReply as AnyReply
+from skyloop.messages.config import AnyRequest as AnyRequest
+from skyloop.messages.config import AuthorityGranted as AuthorityGranted
+from skyloop.messages.config import AuthorityQueued as AuthorityQueued
+from skyloop.messages.config import Capabilities as Capabilities
+from skyloop.messages.config import Done as Done
+from skyloop.messages.config import GetParameter as GetParameter
+from skyloop.messages.config import GetStatistics as GetStatistics
+from skyloop.messages.config import Hello as Hello
+from skyloop.messages.config import JoinProcessor as JoinProcessor
+from skyloop.messages.config import ListParameters as ListParameters
+from skyloop.messages.config import ParameterPage as ParameterPage
+from skyloop.messages.config import ParameterValue as ParameterValue
+from skyloop.messages.config import Ping as Ping
+from skyloop.messages.config import Pong as Pong
+from skyloop.messages.config import Refused as Refused
+from skyloop.messages.config import ReleaseAuthority as ReleaseAuthority
+from skyloop.messages.config import Reply as Reply
+from skyloop.messages.config import Request as Request
+from skyloop.messages.config import RequestAuthority as RequestAuthority
+from skyloop.messages.config import SetParameter as SetParameter
+from skyloop.messages.config import Statistics as Statistics
+from skyloop.messages.config import Welcome as Welcome
+from skyloop.messages.feedback import Event as Event
+from skyloop.messages.feedback import Feedback as Feedback
+from skyloop.messages.feedback import Overview as Overview
+from skyloop.messages.feedback import VehicleOverview as VehicleOverview
+from skyloop.messages.fields import Encoding as Encoding
+from skyloop.messages.fields import EventKind as EventKind
+from skyloop.messages.fields import Failsafe as Failsafe
+from skyloop.messages.fields import FlightState as FlightState
+from skyloop.messages.fields import LinkState as LinkState
+from skyloop.messages.fields import Refusal as Refusal
+from skyloop.messages.fields import ReturnPhase as ReturnPhase
+from skyloop.messages.fields import Role as Role
+from skyloop.messages.fields import Severity as Severity
+from skyloop.messages.fields import Takeover as Takeover
+from skyloop.messages.fields import Value as Value
+from skyloop.messages.fields import Vector as Vector
+from skyloop.messages.frame import CameraInfo as CameraInfo
+from skyloop.messages.frame import EncodedFrame as EncodedFrame
+from skyloop.messages.frame import FrameHeader as FrameHeader
+from skyloop.messages.frame import Intrinsics as Intrinsics
+from skyloop.messages.frame import StreamReport as StreamReport
+from skyloop.messages.parameter import Parameter as Parameter
+from skyloop.messages.parameter import ParameterType as ParameterType
+from skyloop.messages.relayed import Annotation as Annotation
+from skyloop.messages.relayed import LogEntry as LogEntry
+from skyloop.messages.relayed import Points as Points
+from skyloop.messages.relayed import Polyline as Polyline
+from skyloop.messages.relayed import ProcessorResult as ProcessorResult
+from skyloop.messages.relayed import ProcessorShare as ProcessorShare
+from skyloop.messages.relayed import Text as Text
+from skyloop.messages.subscription import FeedbackRequest as FeedbackRequest
+from skyloop.messages.subscription import VideoRequest as VideoRequest
 
-__all__ = [
-    "ACTION_NAMES",
-    "Action",
-    "Annotation",
-    "AnswerTakeover",
-    "AnyAction",
-    "AnyReply",
-    "AnyRequest",
-    "Applied",
-    "Attitude",
-    "AuthorityGranted",
-    "AuthorityQueued",
-    "CameraInfo",
-    "Capabilities",
-    "Command",
-    "DEFAULT_PRIORITY",
-    "Done",
-    "EmergencyStop",
-    "EncodedFrame",
-    "Encoding",
-    "Event",
-    "EventKind",
-    "Failsafe",
-    "Fate",
-    "Feedback",
-    "FeedbackRequest",
-    "FlightState",
-    "FrameHeader",
-    "GetParameter",
-    "GetStatistics",
-    "HIGHEST_PRIORITY",
-    "Hello",
-    "Hover",
-    "Idle",
-    "Intrinsics",
-    "JoinProcessor",
-    "Kind",
-    "LONGEST_TERM_S",
-    "LOWEST_PRIORITY",
-    "Land",
-    "LinkState",
-    "ListParameters",
-    "LogEntry",
-    "Outcome",
-    "Overview",
-    "Parameter",
-    "ParameterPage",
-    "ParameterType",
-    "ParameterValue",
-    "Ping",
-    "Points",
-    "Polyline",
-    "Pong",
-    "Position",
-    "ProcessorResult",
-    "ProcessorShare",
-    "Refusal",
-    "Refused",
-    "ReleaseAuthority",
-    "Reply",
-    "Request",
-    "RequestAuthority",
-    "ResetEmergency",
-    "ReturnPhase",
-    "ReturnToStart",
-    "Role",
-    "Sample",
-    "SetParameter",
-    "Severity",
-    "Statistics",
-    "StreamReport",
-    "Takeoff",
-    "Takeover",
-    "Text",
-    "Value",
-    "Vector",
-    "VehicleOverview",
-    "VehiclePose",
-    "Velocity",
-    "VideoRequest",
-    "Welcome",
-    "decode",
-    "encode",
-]
+__all__ = [name for name in dir() if name[0].isupper() or name in ("decode", "encode")]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
-from typing import Final
+from typing import Final, get_args
 
 import msgspec
 
@@ -26,15 +26,16 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
 
+#: What a packet can hold, in the order of :class:`Kind`.
 Sample = (
     Command
-    | Applied
     | Feedback
     | FrameHeader
     | Event
     | Request
     | Reply
     | Annotation
+    | Applied
     | LogEntry
     | EncodedFrame
     | ProcessorResult
@@ -65,23 +66,7 @@ class Kind(IntEnum):
     STREAM_REPORT = 15
 
 
-KINDS: Final[dict[type[Sample], Kind]] = {
-    Command: Kind.COMMAND,
-    Feedback: Kind.FEEDBACK,
-    FrameHeader: Kind.FRAME,
-    Event: Kind.EVENT,
-    Request: Kind.REQUEST,
-    Reply: Kind.REPLY,
-    Annotation: Kind.ANNOTATION,
-    Applied: Kind.APPLIED,
-    LogEntry: Kind.LOG,
-    EncodedFrame: Kind.ENCODED,
-    ProcessorResult: Kind.RESULT,
-    ProcessorShare: Kind.SHARE,
-    VehiclePose: Kind.POSE,
-    Overview: Kind.OVERVIEW,
-    StreamReport: Kind.STREAM_REPORT,
-}
+KINDS: Final[dict[type[Sample], Kind]] = dict(zip(get_args(Sample), Kind, strict=True))
 
 _encode_body = msgspec.msgpack.Encoder().encode
 _KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}
@@ -98,8 +83,8 @@ _BY_PREFIX: Final = {
 def encode(sample: Sample) -> bytes:
     """Encode a sample as a packet.
 
-    Raises:
-        ValueError: The body is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
+    Raises ``ValueError`` if the body is larger than :data:`MAX_BODY`, which only free text or native telemetry can
+    cause.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:
@@ -108,16 +93,9 @@ def encode(sample: Sample) -> bytes:
 
 
 def decode(packet: bytes | memoryview) -> Sample:
-    """Decode a packet, in bounded time and memory.
+    """Decode a packet from any source, in bounded time and memory, and check its types, lengths and ranges.
 
-    Args:
-        packet: The bytes, which may come from any source.
-
-    Returns:
-        The sample, with its types, lengths and ranges checked.
-
-    Raises:
-        DecodeError: The bytes are not a packet with a valid sample.
+    Raises :class:`DecodeError` if the bytes are not a packet with a valid sample.
     """
     # One look-up checks signature, version, kind and reserved bytes; only a failure is analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
@@ -135,8 +113,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 def packet_kind(packet: bytes | memoryview) -> int:
     """Return a packet's kind, after checking that its header matches its length.
 
-    Raises:
-        DecodeError: The header is of another version, or does not match the packet.
+    Raises :class:`DecodeError` if the header is of another version, or does not match the packet.
     """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")

@@ -77,7 +77,6 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers of the action are finite."""
         return math.isfinite(self.roll + self.pitch + self.climb + self.yaw_rate)
 
 
@@ -91,7 +90,6 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers of the action are finite."""
         return math.isfinite(self.forward + self.left + self.up + self.yaw_rate)
 
 
@@ -111,14 +109,12 @@ class Position(Action, frozen=True, array_like=True, tag=8):
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers of the action are finite."""
         return math.isfinite(
             self.x + self.y + self.z + (self.yaw or 0.0) + (self.speed or 0.0) + (self.turn_rate or 0.0)
         )
 
     @property
     def problem(self) -> str:
-        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
         for name in ("x", "y", "z"):
             if abs(value := getattr(self, name)) > MAX_RANGE_M:
                 return f"{name} is {value:g} m and must be within {MAX_RANGE_M:g} m of the vehicle's origin"
@@ -148,12 +144,10 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers of the action are finite."""
         return math.isfinite(self.height or 0.0)
 
     @property
     def problem(self) -> str:
-        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
         if self.height is not None and not 0.0 <= self.height <= MAX_RANGE_M:
             return f"height is {self.height:g} m above the start and must be from 0 to {MAX_RANGE_M:g} m"
         return ""
@@ -284,17 +278,10 @@ def check_pose(
     position_std_m: float | None = None,
     attitude_std_rad: float | None = None,
 ) -> None:
-    """Check the numbers of a pose.
+    """Check the numbers of a pose: x, y, z [m]; x, y, z, w; standard deviations [m, rad], None if unknown.
 
-    Args:
-        position: x, y, z [m].
-        quaternion: x, y, z, w.
-        position_std_m: Standard deviation of the position [m], 0 or more; None if unknown.
-        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if unknown.
-
-    Raises:
-        UsageError: If a number is missing or not finite, a standard deviation is negative, or the quaternion's length
-            differs from 1 by more than 0.001.
+    Raises :class:`UsageError` if a number is missing or not finite, a standard deviation is negative, or the
+    quaternion's length differs from 1 by more than 0.001.
     """
     for name, axes, values in (("position", "x, y, z", position), ("quaternion", "x, y, z, w", quaternion)):
         count = len(axes.split(", "))

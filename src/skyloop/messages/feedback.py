@@ -106,12 +106,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
         return rotation_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
 
-_KEYS: Final = (
-    "origin.latitude_deg",
-    "origin.longitude_deg",
-    "origin.altitude_amsl_m",
-    "origin.radius_m",
-)
+_KEYS: Final = ("origin.latitude_deg", "origin.longitude_deg", "origin.altitude_amsl_m", "origin.radius_m")
 
 
 class EarthOrigin(NamedTuple):
@@ -142,10 +137,8 @@ class EarthOrigin(NamedTuple):
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
         """Return a geographic position in world axes: x east, y north, z up [m].
 
-        Args:
-            latitude_deg: Latitude [°], north positive.
-            longitude_deg: Longitude [°], east positive; the shorter way around the earth is used.
-            altitude_m: Altitude above mean sea level [m].
+        Latitude [°] is positive north, longitude [°] east, by the shorter way around the earth; the altitude [m] is
+        above mean sea level.
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
@@ -245,12 +238,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as from a real vehicle, for benchmarks.
-
-    Args:
-        captured_ns: Time of capture [ns].
-        state: The flight state.
-    """
+    """Return feedback with as many values as from a real vehicle, for benchmarks."""
     return Feedback(
         captured_ns=captured_ns,
         state=state,

@@ -39,12 +39,7 @@ def shape_fits(shape: Sequence[int], count: int, most: int) -> bool:
     """Return whether an array of this shape has ``count`` elements and its axes are not excessively long.
 
     A zero makes the product of the lengths 0, however large the others are, and a loop over those would never end.
-    Therefore the product is also bounded with each 0 counted as 1.
-
-    Args:
-        shape: Length of each axis.
-        count: Number of elements.
-        most: Maximum product of the lengths, with each 0 counted as 1.
+    Therefore the product with each 0 counted as 1 is at most ``most``.
     """
     return math.prod(shape) == count and math.prod(max(1, length) for length in shape) <= most
 
@@ -104,6 +99,9 @@ class Encoding(StrEnum):
     RGB8 = "rgb8"  #: the same with red first
     MONO8 = "mono8"  #: height × width bytes
     JPEG = "jpeg"  #: one JPEG file
+
+
+CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}  #: bytes per pixel of the raw encodings
 
 
 class Role(StrEnum):

@@ -112,11 +112,7 @@ class StreamReport(msgspec.Struct, frozen=True, array_like=True):
 
 
 def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
-    """Yield the pieces of a picture in order, or the picture itself if it fits into a packet.
-
-    Args:
-        picture: A whole picture, of at most :data:`MAX_ENCODED` bytes.
-    """
+    """Yield the pieces of a whole picture in order, or the picture itself if it fits into a packet."""
     pieces = -(-len(picture.data) // MAX_PIECE)
     if pieces <= 1:
         yield picture
@@ -158,12 +154,7 @@ class Chain:
         self._last: int | None = None  # None while waiting for a key picture
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Return whether the next picture received can be decoded; False for duplicates.
-
-        Args:
-            number: The picture's ``seq``.
-            key: Whether it is a key picture.
-        """
+        """Return whether the next picture received, with this ``seq``, can be decoded; False for duplicates."""
         if number == self._last and not key:
             return False
         whole = key or (self._last is not None and number == self._last + 1)
@@ -192,11 +183,7 @@ _ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: markers that end a header: a se
 
 
 def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
-    """Return width and height [px] from the header of a JPEG or PNG.
-
-    Returns:
-        None for other formats and damaged headers.
-    """
+    """Return width and height [px] from the header of a JPEG or PNG; None if it is damaged or of another format."""
     if data[:8] == _PNG:
         if data[12:16] != b"IHDR" or len(data) < 24:
             return None

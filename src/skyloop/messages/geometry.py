@@ -15,15 +15,9 @@ _Angle = TypeVar("_Angle", float, NDArray[np.float64])
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
-    """Return the rotation from body to world axes: ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``.
+    """Return the rotation from body to world axes, shape (3, 3): ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``.
 
-    Args:
-        roll: About x, right side down positive [rad].
-        pitch: About y, nose down positive [rad].
-        yaw: About z, counter-clockwise seen from above positive [rad].
-
-    Returns:
-        Shape (3, 3), float64.
+    Angles [rad] are positive for the right side down, the nose down, and counter-clockwise seen from above.
     """
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
@@ -38,13 +32,7 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.flo
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the rotation of :func:`rotation_from_euler` as a unit quaternion (x, y, z, w), as in SciPy and ROS.
-
-    Args:
-        roll: About x, right side down positive [rad].
-        pitch: About y, nose down positive [rad].
-        yaw: About z, counter-clockwise seen from above positive [rad].
-    """
+    """Return the rotation of :func:`rotation_from_euler` as a unit quaternion (x, y, z, w), as in SciPy and ROS."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -57,14 +45,7 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float,
 
 
 def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return the angles of a rotation from body to world axes.
-
-    Args:
-        rotation: Shape (3, 3).
-
-    Returns:
-        Roll, pitch and yaw [rad]; pitch is within ±π/2.
-    """
+    """Return roll, pitch (within ±π/2) and yaw [rad] of a rotation from body to world axes, shape (3, 3)."""
     pitch = math.asin(max(-1.0, min(1.0, -float(rotation[2, 0]))))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     yaw = math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))

@@ -52,21 +52,13 @@ _Text = Annotated[str, msgspec.Meta(max_length=600)]
 
 
 class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
-    """A finding about a vehicle or its settings that matters before a flight.
+    """A finding about a vehicle or its settings that matters before a flight."""
 
-    Attributes:
-        what: What was examined.
-        good: Whether the result is good.
-        detail: The result.
-        advice: What to do about it; empty if there is nothing to do.
-        severe: Whether it is dangerous or sure to fail, rather than just a disabled safety net.
-    """
-
-    what: _Text
-    good: bool
-    detail: _Text
-    advice: _Text = ""
-    severe: bool = False
+    what: _Text  #: what was examined
+    good: bool  #: whether the result is good
+    detail: _Text  #: the result
+    advice: _Text = ""  #: what to do about it; empty if there is nothing to do
+    severe: bool = False  #: whether it is dangerous or sure to fail, rather than just a disabled safety net
 
 
 _checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
@@ -81,11 +73,7 @@ def encode_checkup(diagnostics: list[Diagnostic]) -> str:
 
 
 def decode_checkup(text: str) -> list[Diagnostic]:
-    """Decode the diagnostics in a parameter's text.
-
-    Raises:
-        ValueError: The text holds none.
-    """
+    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if it holds none."""
     return _checkup_decoder.decode(text.encode())
 
 
@@ -167,9 +155,5 @@ def encode_world(world: WorldGeometry) -> str:
 
 
 def decode_world(text: str) -> WorldGeometry:
-    """Decode the world in a parameter's text.
-
-    Raises:
-        ValueError: The text is not a world.
-    """
+    """Decode the world in a parameter's text. Raises ``ValueError`` if it is none."""
     return _world_decoder.decode(text.encode())

@@ -155,14 +155,10 @@ class _Array(msgspec.Struct, frozen=True, array_like=True):
 
 
 def pack(value: Any) -> bytes:
-    """Encode a result's value.
+    """Encode a result's value. Raises :class:`UsageError` if that is impossible, or it takes more than 32 768 bytes.
 
-    Args:
-        value: None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a NumPy
-            array of :data:`DTYPES`, nested at most :data:`MAX_DEPTH` deep.
-
-    Raises:
-        UsageError: The value can't be encoded, or takes more than 32 768 bytes.
+    It may be None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a NumPy
+    array of :data:`DTYPES`, nested at most :data:`MAX_DEPTH` deep.
     """
     try:
         data = _encoder.encode(value)
@@ -181,8 +177,7 @@ def pack(value: Any) -> bytes:
 def unpack(payload: bytes) -> Any:
     """Decode a payload; arrays are read-only, and tuples become lists.
 
-    Raises:
-        DecodeError: :func:`pack` could not have encoded these bytes.
+    Raises :class:`DecodeError` for bytes that :func:`pack` could not have encoded.
     """
     try:
         value = _decoder.decode(payload)

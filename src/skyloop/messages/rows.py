@@ -2,37 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.command import Attitude, Velocity
 from skyloop.messages.feedback import Feedback
-from skyloop.messages.fields import Vector
 
-_Number = Callable[[Feedback], float | None]
-
-
-def _part(of: Callable[[Feedback], Vector | None], axis: int) -> _Number:
-    def number(feedback: Feedback) -> float | None:
-        vector = of(feedback)
-        return None if vector is None else vector[axis]
-
-    return number
-
-
-_NUMBERS: Final[dict[str, _Number]] = {
-    "roll_rad": lambda feedback: feedback.roll_rad,
-    "pitch_rad": lambda feedback: feedback.pitch_rad,
-    "yaw_rad": lambda feedback: feedback.yaw_rad,
-    "altitude_m": lambda feedback: feedback.altitude_m,
-    "velocity_forward_m_s": _part(lambda feedback: feedback.velocity_m_s, 0),
-    "velocity_left_m_s": _part(lambda feedback: feedback.velocity_m_s, 1),
-    "velocity_up_m_s": _part(lambda feedback: feedback.velocity_m_s, 2),
-}
-
+_VELOCITY: Final = ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s")
 #: Names of the numbers in a drone's own state, which have the axes and units of :class:`Feedback`.
-STATE: Final = tuple(_NUMBERS)
+STATE: Final = ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m", *_VELOCITY)
 #: Names of the numbers in an application's set-points, by the set-point's name.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
@@ -41,23 +20,19 @@ ACTIONS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
-    """Return a drone's state as a row.
+    """Return the numbers of these names, from :data:`STATE`, in a drone's state; None if any is unknown.
 
-    Args:
-        feedback: The state.
-        names: Names of the numbers to return, from :data:`STATE`.
-
-    Returns:
-        The numbers, in the order of their names; None if any is unknown.
-
-    Raises:
-        UnknownNameError: A name is not in :data:`STATE`.
+    Raises :class:`UnknownNameError` for a name that is not in :data:`STATE`.
     """
     row = []
     for name in names:
-        if name not in _NUMBERS:
+        if name not in STATE:
             raise UnknownNameError("number of a drone's state", name, STATE)
-        number = _NUMBERS[name](feedback)
+        if name in _VELOCITY:
+            velocity = feedback.velocity_m_s
+            number = None if velocity is None else velocity[_VELOCITY.index(name)]
+        else:
+            number = getattr(feedback, name)
         if number is None:
             return None
         row.append(number)
@@ -65,14 +40,9 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
 
 def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
-    """Return the set-point in a row.
+    """Return the set-point of a kind in :data:`ACTIONS` from its numbers, in the order given there.
 
-    Args:
-        kind: A key of :data:`ACTIONS`.
-        row: Its numbers, in the order of :data:`ACTIONS`.
-
-    Raises:
-        UsageError: The row has the wrong length.
+    Raises :class:`UsageError` if the row has the wrong length.
     """
     names = ACTIONS[kind]
     if len(row) != len(names):

@@ -35,12 +35,9 @@ _FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "
 
 @dataclass(frozen=True, slots=True)
 class FeedbackRequest:
-    """One consumer's request for feedback.
+    """One consumer's request for feedback. Requests for the same samples are equal and have the same :attr:`topic`.
 
-    Requests for the same samples are equal and have the same :attr:`topic`.
-
-    Raises:
-        UsageError: ``max_hz`` is not between :data:`MIN_HZ` and :data:`MAX_HZ`.
+    Raises :class:`UsageError` if ``max_hz`` is not between :data:`MIN_HZ` and :data:`MAX_HZ`.
     """
 
     max_hz: float | None = None  #: maximum number of samples a second; None: all
@@ -71,12 +68,9 @@ class FeedbackRequest:
 
     @classmethod
     def parse(cls, topic: str) -> Self:
-        """Parse a topic, which must have exactly the form of :attr:`topic`.
+        """Parse a topic, which must have exactly the form of :attr:`topic`; raise :class:`UsageError` otherwise.
 
         This way each request has only one topic, and is encoded once.
-
-        Raises:
-            UsageError: The topic is not a feedback topic, or has another form.
         """
         if topic == FEEDBACK:
             return cls()
@@ -102,14 +96,10 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """One consumer's request for a camera's frames.
+    """One consumer's request for a camera's frames; H.264 has its own topic, :attr:`stream_topic`.
 
-    H.264 has its own topic, :attr:`stream_topic`.
-
-    Requests for the same frames are equal and have the same :attr:`topic`.
-
-    Raises:
-        UsageError: A value is invalid.
+    Requests for the same frames are equal and have the same :attr:`topic`. Raises :class:`UsageError` for invalid
+    values.
     """
 
     camera: str
@@ -197,11 +187,7 @@ class VideoRequest:
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """Parse a video topic.
-
-        Raises:
-            UsageError: The topic does not belong to a camera's frames.
-        """
+        """Parse a video topic. Raises :class:`UsageError` for any other."""
         prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
         camera, _, variant = topic.removeprefix(prefix).partition("?")
         if not topic.startswith(prefix) or not camera:
@@ -216,12 +202,9 @@ class VideoRequest:
 
 
 class FrameFilter:
-    """Selects the frames for a request from those of one camera, by number and capture time.
+    """Selects the frames for a request (``part``, ``max_fps``) from those of one camera, by number and capture time.
 
     It keeps state, so each stream of frames needs its own.
-
-    Args:
-        request: The request, of which only ``part`` and ``max_fps`` are used.
     """
 
     def __init__(self, request: VideoRequest) -> None:
@@ -231,9 +214,7 @@ class FrameFilter:
     def wants(self, seq: int, captured_ns: int) -> bool:
         """Return whether the request includes this frame. Call it once for each frame, in order.
 
-        Args:
-            seq: The frame's number.
-            captured_ns: Its capture time [ns], on any clock as long as it is always the same.
+        The capture time [ns] may be on any clock as long as it is always the same.
         """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
@@ -247,11 +228,7 @@ class RateLimiter:
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Keep the first sample that arrives.
-
-        Args:
-            max_hz: Maximum rate, greater than 0; None: keep all samples.
-        """
+        """Keep the first sample that arrives. None: keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
@@ -267,8 +244,7 @@ class RateLimiter:
     def in_time(self, at_ns: int) -> bool:
         """Return whether to keep a sample. Call it once for each sample, in order.
 
-        Args:
-            at_ns: Its time [ns], on any clock as long as it is always the same.
+        Its time [ns] may be on any clock as long as it is always the same.
         """
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:

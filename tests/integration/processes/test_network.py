@@ -77,7 +77,7 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert (row.name, row.transport, row.host, row.pid) == ("alpha", "fabric", os.uname().nodename, alpha.pid)
     assert (row.vehicle, row.state, row.owner, row.problem) == ("sim", "landed", None, "")
     with skyloop.connect("alpha", network=place) as drone:
-        assert f"(pid {alpha.pid})" in drone._connection._session.address  # type: ignore[union-attr]
+        assert f"(pid {alpha.pid})" in drone._connection.session.address  # type: ignore[union-attr]
         assert drone._reach is None, "a process without the network option does not find it"
         drone.takeoff()
         drone.velocity(forward=0.3)

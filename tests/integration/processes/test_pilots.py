@@ -134,7 +134,7 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_anot
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
     pilot = drone._commands
-    packet = encode(Command(pilot._seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
+    packet = encode(Command(pilot._seq + 1, lease, pilot.schedule.intent, time.monotonic_ns(), action))
     pilot._seq += 1
     assert drone._connection.transmit(packet)
 

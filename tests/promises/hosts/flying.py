@@ -151,7 +151,7 @@ def priority(here: Here, name: str) -> int:
 def watch_numbers(here: Here, name: str) -> None:
     """Record the number of each feedback packet, including duplicates."""
     found = here.objects[f"{name} numbers"] = []
-    connection = here.drones[name]._connection._session
+    connection = here.drones[name]._connection.session
     assert connection is not None
     monitor = connection.monitor
     original = monitor.feedback

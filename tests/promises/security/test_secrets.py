@@ -21,7 +21,7 @@ import skyloop
 from skyloop.address import shown_address
 from skyloop.cockpit.access import Person, Token
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.camera_options import source_of
+from skyloop.drivers.live_camera import source_of
 from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import DriverError, SkyloopError
 from skyloop.host.fleet import encode_handed, parse_fleet

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.live_frames import LATE_NS, MAX_FRAMES, Coded, FrameBacklog
+from skyloop.drivers.live_video import LATE_NS, MAX_FRAMES, Coded, FrameBacklog
 from skyloop.vehicles.ardrone.video import DroneStamps
 
 MS = 1_000_000

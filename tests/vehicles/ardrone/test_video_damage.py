@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.errors import UnsupportedError
 from skyloop.vehicles.ardrone.emulator.video import MP4_360P
 from skyloop.vehicles.ardrone.video import PaveAssembly, PaveVideo

@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import Intrinsics
 from skyloop.vehicles.ardrone.video import EncodedStream, VideoReceiver

@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.live_frames import LATE_NS
-from skyloop.drivers.live_video import VideoCounters, VideoEvent
+from skyloop.drivers.live_video import LATE_NS, VideoCounters, VideoEvent
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.vehicles.ardrone.video import VideoReceiver
 from tests.support.recordings import needs_recordings

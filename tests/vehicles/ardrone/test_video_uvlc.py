@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.live_frames import Coded
-from skyloop.drivers.live_video import VideoEvent
+from skyloop.drivers.live_video import Coded, VideoEvent
 from skyloop.vehicles.ardrone.emulator.video import encode
 from skyloop.vehicles.ardrone.video import WAKE, UvlcVideo
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, is_intra, is_p264

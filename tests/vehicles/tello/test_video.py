@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from skyloop.drivers.live_frames import Coded
+from skyloop.drivers.live_video import Coded
 from skyloop.drivers.uri import parse_uri
 from skyloop.vehicles.emulation.video import OneCamera
 from skyloop.vehicles.tello.emulator import FRONT, GROUP, TelloPacker

@@ -7,7 +7,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.camera_options import intrinsics_of
+from skyloop.drivers.live_camera import intrinsics_of
 from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver

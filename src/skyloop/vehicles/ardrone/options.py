@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.live_camera import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.vehicles.ardrone.telemetry import OPTION_TAGS

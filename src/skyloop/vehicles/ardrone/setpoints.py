@@ -16,8 +16,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent, message
+from skyloop.drivers.vehicle_session import MotorStop, VehicleEvent, message
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,

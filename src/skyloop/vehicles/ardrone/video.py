@@ -19,10 +19,9 @@ import numpy as np
 
 from skyloop.clock import Clock, LiveClock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.camera_options import intrinsics_of
 from skyloop.drivers.h264 import Unit
-from skyloop.drivers.live_frames import Coded, StreamRelay
-from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
+from skyloop.drivers.live_camera import intrinsics_of
+from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveVideo, Picture, Stream, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics

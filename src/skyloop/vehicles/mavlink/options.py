@@ -10,8 +10,15 @@ from functools import partial
 from typing import Final
 
 from skyloop.drivers.base import Sink, reject_unknown_options
-from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, CameraSource, check_intrinsics, intrinsics_of, source_of
-from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
+from skyloop.drivers.live_camera import (
+    INTRINSICS_OPTIONS,
+    CameraSource,
+    LiveCamera,
+    LiveCameraSettings,
+    check_intrinsics,
+    intrinsics_of,
+    source_of,
+)
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.files import expand, read_bytes

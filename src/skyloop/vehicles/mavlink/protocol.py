@@ -8,11 +8,11 @@ from typing import Final, NamedTuple
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.byte_stream import Rank
-from skyloop.drivers.motor_stop import MotorStop
 from skyloop.drivers.vehicle_session import (
     Arrival,
     LinkTimeouts,
     LinkTrouble,
+    MotorStop,
     VehicleEvent,
     VehicleSession,
     serial_trouble,

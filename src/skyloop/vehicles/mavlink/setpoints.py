@@ -12,8 +12,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import KEPT_NS, VehicleEvent
+from skyloop.drivers.vehicle_session import KEPT_NS, MotorStop, VehicleEvent
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -112,7 +111,7 @@ class SetpointController:
     ) -> AnyAction:
         """Accept an action; return the action in force, which is idle if it is ignored.
 
-        While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`), a take-off is refused
+        While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused
         and all other actions are ignored. ``alone``: a failsafe requested it while no pilot was in command; ``new``: an
         application newly requested it, so that it is none of the library's repeats. Raises :class:`DriverError` if the
         action is not possible now, or another operator has the vehicle.

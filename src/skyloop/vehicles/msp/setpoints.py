@@ -13,8 +13,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.motor_stop import MotorStop
-from skyloop.drivers.vehicle_session import VehicleEvent, message
+from skyloop.drivers.vehicle_session import MotorStop, VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
 from skyloop.messages.geometry import clamped

@@ -7,8 +7,7 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.h264 import Unit
-from skyloop.drivers.live_frames import Coded, StreamRelay
-from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
+from skyloop.drivers.live_video import Coded, LiveVideo, Picture, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError

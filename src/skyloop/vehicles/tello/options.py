@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
-from skyloop.drivers.camera_options import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.live_camera import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.vehicles.tello.wire import PORT, STATE_PORT, VIDEO_PORT

@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 
 from skyloop.clock import Clock, nanoseconds
-from skyloop.drivers.camera_options import intrinsics_of
-from skyloop.drivers.live_frames import Coded
-from skyloop.drivers.live_video import Decoded
+from skyloop.drivers.live_camera import intrinsics_of
+from skyloop.drivers.live_video import Coded, Decoded
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
 from skyloop.files import wait_readable

@@ -13,15 +13,15 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.drivers.base import Driver, Sink, reject_unknown_options
-from skyloop.drivers.camera_options import (
+from skyloop.drivers.live_camera import (
     INTRINSICS_OPTIONS,
     CameraSource,
+    LiveCamera,
+    LiveCameraSettings,
     check_intrinsics,
     intrinsics_of,
-    is_address,
     source_of,
 )
-from skyloop.drivers.live_camera import LiveCamera, LiveCameraSettings
 from skyloop.drivers.live_video import VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UnknownNameError, UsageError
@@ -257,7 +257,7 @@ def options_of(uri: VehicleUri) -> VideoOptions:
 
 def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
     place = uri.reveal_place()
-    if is_address(place):
+    if "://" in place:
         return Path(), source_of(place, f"{uri.scheme}://")
     path = expand(place)
     return path, CameraSource(str(path), "") if is_device(path) else None

@@ -18,7 +18,7 @@ from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_container import Units
-from skyloop.drivers.live_frames import CheckedRelay, StreamRelay
+from skyloop.drivers.live_video import CheckedRelay, StreamRelay
 from skyloop.errors import FileFormatError, SkyloopError, UsageError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
 from skyloop.messages.frame import H264
