@@ -1,4 +1,4 @@
-"""A detector that runs anywhere, and a controller that turns towards its detections.
+"""Run a detector on any host, and a controller that turns towards its detections.
 
 skyloop proxy sim:// --name alpha                                             # on the host of the drone
 skyloop process examples/detector_on_another_host.py:Detector --drone alpha   # on another, as often as you like

@@ -3,11 +3,10 @@
 python examples/behaviours/see_and_avoid.py             # in a simulated hall
 python examples/behaviours/see_and_avoid.py alpha 6     # a running proxy, 6 m ahead
 
-A custom behaviour, with its law and the technique behind it.
-
-A fuzzy controller keeps an obstacle, detected by its colour, out of the middle of the image, as in Olivares-Mendez,
-Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by cross-entropy",
-FUZZ-IEEE 2012. Here the rules map its bearing and apparent width to the sideways speed.
+This is a complete custom behaviour with its own law. A fuzzy controller keeps an obstacle, detected by its colour, out
+of the middle of the image, as in Olivares-Mendez, Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using
+fuzzy control optimized by cross-entropy", FUZZ-IEEE 2012. Here the rules map the obstacle's bearing and apparent width
+to the sideways speed.
 
 The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is their mean, weighted by the rules'
 truth; a rule's truth is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of systems and its
@@ -181,11 +180,11 @@ class AvoidPhase(StrEnum):
 class AvoidSettings:
     """Speeds and distances of :class:`AvoidLaw`."""
 
-    speed_m_s: float = 0.6  #: ahead
+    speed_m_s: float = 0.6  #: forward speed
     aside_m_s: float = 0.7  #: greatest sideways speed
     close_rad: float = 0.9  #: apparent width of an obstacle at which the speed ahead is 0
-    back_share: float = 0.25  #: share of the speed for backing off when blocked
-    avoiding_rad: float = 0.15  #: avoid obstacles with a larger apparent width
+    back_share: float = 0.25  #: fraction of the speed used to back off when blocked
+    avoiding_rad: float = 0.15  #: obstacles with a larger apparent width are avoided
     passing_s: float = 2.5  #: a side stays blocked for this long after an obstacle left the image there
     yaw_gain: float = 1.5  #: [1/s]
     acceleration_m_s2: float = 2.0
@@ -257,7 +256,7 @@ class AvoidLaw(VelocityLaw):
         return replace(one, left_rad=at + half, right_rad=at - half)
 
     def _share(self) -> float:
-        """Return the share of the speed ahead, which falls with the width of an obstacle ahead."""
+        """Return the fraction of the forward speed, which falls with the width of an obstacle ahead."""
         in_the_way = (one.width_rad for one in self._seen if abs(one.bearing_rad) < one.width_rad / 2 + 0.2)
         return max(0.0, 1.0 - max(in_the_way, default=0.0) / self.settings.close_rad)
 
