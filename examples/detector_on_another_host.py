@@ -32,7 +32,7 @@ class Detector:
 
 
 class Face(skyloop.Controller):
-    """Turns on the spot until a marker is in the middle of the image."""
+    """Turns on the spot until a marker is in the centre of the image."""
 
     processors = ("detector",)
     result_max_age_s = 0.5  # older results are skipped and counted

@@ -94,9 +94,9 @@ def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """If every variable is as in ``when``, the output is ``then``."""
+    """If every variable matches ``when``, the output is ``then``."""
 
-    when: Mapping[str, str]  #: term by variable; a variable not named can have any value
+    when: Mapping[str, str]  #: term of each variable; a variable without one may have any value
     then: float
 
 
@@ -202,8 +202,8 @@ class AvoidLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            distance_m: Distance to fly ahead.
-            settings: None are the defaults.
+            distance_m: Distance to fly straight ahead.
+            settings: None means the defaults.
         """
         self.settings = s = settings or AvoidSettings()
         super().__init__(SetpointLimits(acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
@@ -271,7 +271,7 @@ class AvoidLaw(VelocityLaw):
 
 
 class SeeAndAvoid(Behaviour):
-    """Flies ahead for a distance at one height and yaw, past obstacles of a colour; then hovers."""
+    """Flies straight ahead at a constant height and yaw, avoids obstacles of one colour, and hovers at the end."""
 
     name = "see and avoid"
 
@@ -288,10 +288,10 @@ class SeeAndAvoid(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            distance_m: Distance to fly ahead.
+            distance_m: Distance to fly straight ahead.
             colour: Red, green, blue of the obstacles, 0 to 255.
             camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults.
+            settings: Settings of the law; None means the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the colour has no hue.
@@ -311,7 +311,7 @@ class SeeAndAvoid(Behaviour):
 
     @property
     def ahead_m(self) -> float:
-        """Distance flown ahead [m]."""
+        """Distance flown straight ahead [m]."""
         return self._avoid_law.ahead_m
 
     def look(self, frame: Frame) -> list[Shape]:
