@@ -1,4 +1,4 @@
-"""Real firmware in the simulated world: flies a square and follows a marker, compared with the truth.
+"""Fly a square and follow a marker with real firmware in the simulated world, and compare with the truth.
 
 ``SKYLOOP_ARDUCOPTER=… python -m benchmarks.autopilots ardupilot`` prints the figures of ``docs/autopilots.md``.
 """

@@ -1,11 +1,11 @@
-"""The cockpit's video of many drones: frames and their age in each pane, bytes, and the cost of each part.
+"""Measure the cockpit's video of many drones: frame rate and age in each pane, bytes, and the cost of each part.
 
 ``python -m benchmarks.cockpit_fleet --drones 12 --seconds 20`` starts the simulator, a cockpit and headless Chromium on
 this machine, with a separate directory of sockets. It shows all drones as H.264, then as JPEGs, as for a browser
 without a decoder; then one drone's pane in both. It needs Chromium and ``pip install playwright``.
 
 An age runs from a frame's capture until the browser begins the animation frame that shows it, on one clock: the page's
-clock is compared with this process's. Shares are of one core, from the processor time of each process and its children:
+clock is compared with this process's. Loads are of one core, from the processor time of each process and its children:
 on a busy machine they remain meaningful, while the number of frames depends on the machine. The load before and after
 is printed.
 """

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.codecs``: processor time of the AR.Drones' video and navdata on one core.
+"""Measure the processor time of the AR.Drones' video and navdata on one core: ``python -m benchmarks.codecs``.
 
 Measured in a process limited to one core from its start, because libraries start a thread for each core they find.
 Counts processor time, without that of other programs.

@@ -1,11 +1,10 @@
-"""``python -m benchmarks.damaged_video``: how much video is shown after losing datagrams, and how much of it correctly.
+"""Measure how much video is shown after losing datagrams, and how much of it correctly.
 
 The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, ``tests/support/recordings.py``) is sent in
-three ways: unchanged, in pieces of the drone's stream; re-encoded like the emulated Tello, at its bit rate and in its
-datagrams; and unchanged again, in pieces of an RTP packet's size, to the decoder of network cameras. A seeded share of
-the pieces is lost each time. FFmpeg's own decoder (PyAV's, with its error concealment) gets the remaining pieces of the
-same pictures, cut at their beginnings, which FFmpeg alone could not do as surely. A picture counts as right if its PSNR
-against that of the undamaged stream is 40 dB or more.
+three ways: in pieces of the drone's stream; re-encoded in the emulated Tello's datagrams at its bit rate; and in pieces
+of an RTP packet's size to the decoder for network cameras. Each time a random fraction of the pieces is lost. For
+comparison, FFmpeg's own decoder with its error concealment gets the remaining pieces, already split into frames, which
+FFmpeg alone could not do as reliably. A frame counts as right if its PSNR against the undamaged one is 40 dB or more.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""``python -m benchmarks.detector``: results of the detector of the simulator's figures on unknown pictures.
+"""Measure the detector of the simulator's figures on images that it was not trained on.
 
-Pictures of ``street`` and ``yard``, at places and times of seeds never used for training, as the camera sees them and
-degraded. A figure counts if it is at least 14 pixels high, at least half visible and, at the picture's edge, 8 pixels
-of it are in view (pixels of a picture 320 wide); detections of other figures are neither right nor wrong. Takes some
-two minutes on one core.
+The images show ``street`` and ``yard`` at places and times that training never used, as the camera sees them and
+degraded. A figure counts if it is at least 14 pixels high, at least half visible and, at the image's edge, has 8 pixels
+in view (pixels of an image 320 wide). Detections of other figures are neither right nor wrong. It takes about two
+minutes on one core.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The agreement of a detector's boxes with the true ones: matches, average precision. Pure."""
+"""Compare a detector's boxes with the true ones: matches, average precision. Pure."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The targets of a detector with grids of three strides: assigns things to places. Pure.
+"""Assign objects to the cells of a detector's three grids, as its training targets. Pure.
 
-As in FCOS, a thing belongs to the grids that suit its size, and there to the places around its centre (Tian et al.,
+As in FCOS, an object belongs to the grids that suit its size, and there to the cells around its centre (Tian et al.,
 "FCOS: Fully Convolutional One-Stage Object Detection", ICCV 2019).
 """
 

@@ -1,4 +1,4 @@
-"""A disk that a recorder fills within moments."""
+"""Provide a disk that a recorder fills within a second."""
 
 from __future__ import annotations
 

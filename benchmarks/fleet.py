@@ -1,4 +1,4 @@
-"""A hundred vehicles in one host, flown from one process: arrivals, delays and costs."""
+"""Fly a hundred vehicles of one host from one process, and measure arrivals, delays and costs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gymnasium environments: steps and pictures of 84×84 per second on one core."""
+"""Measure the Gymnasium environments: steps and 84×84 images per second on one core."""
 
 from __future__ import annotations
 

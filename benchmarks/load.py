@@ -1,4 +1,4 @@
-"""The pilot's delays with other applications that watch, are slow, stall or record."""
+"""Measure the pilot's delays while other applications watch, are slow, stall or record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Emulated MAVLink vehicles in one host, half of them flown in formation by one program."""
+"""Fly half of one host's emulated MAVLink vehicles in formation from one program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A moving camera's view, shared by all senders of video: pictures determined by their stamps. Needs NumPy alone.
+"""Render a moving camera's view for all senders of video; an image depends only on its stamp. Needs only NumPy.
 
 A window of a large picture, with detail at all scales and some noise, moves like a drone that looks around. Each
 picture carries its stamp in its upper left corner, in a form that survives any encoder, because some transports keep

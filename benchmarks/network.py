@@ -1,4 +1,4 @@
-"""``python -m benchmarks.network``: two hosts with a lossy path between, by datagrams and TCP, or TCP alone."""
+"""Measure delays between two hosts over a lossy path, by datagrams and TCP or by TCP alone: ``benchmarks.network``."""
 
 from __future__ import annotations
 

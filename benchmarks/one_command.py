@@ -1,4 +1,4 @@
-"""The command line of a program with one command."""
+"""Build the command line of a program with one command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that watch while the pilot flies: observers, a recorder, cockpit pages, a Foxglove viewer."""
+"""Start processes that watch while the pilot flies: observers, a recorder, cockpit pages, a Foxglove viewer."""
 
 from __future__ import annotations
 

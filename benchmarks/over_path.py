@@ -1,4 +1,4 @@
-"""Skyloop's ends of ``benchmarks.video_path``: a camera that moves, and a pilot who watches it in one form or none."""
+"""Skyloop's ends of ``benchmarks.video_path``: a moving camera, and a pilot who watches it in one encoding or none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording of ten minutes, and the time to open, inspect, seek and export it.
+"""Measure the time to open, inspect, seek and export a recording of ten minutes.
 
 The video is H.264 of a simulated flight, 640×360, 30 pictures a second, a key picture each second. Half a minute of it
 is drawn and encoded; the recording repeats that with the times of a whole flight.

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.ros``: the delay added by the bridge to ROS 2, in one run with Skyloop's own.
+"""Measure the delay that the bridge to ROS 2 adds, in one run with Skyloop's own: ``python -m benchmarks.ros``.
 
 Four processes: a simulated drone's proxy, the bridge, a program of rclpy that flies by ``cmd_vel`` and receives images,
 and this one, which receives the same images and the echoes of the commands like any Skyloop client.

@@ -1,4 +1,4 @@
-"""Responses of the rotor-level vehicles, compared with published ones of real vehicles.
+"""Compare the responses of the rotor-level vehicles with published ones of real vehicles.
 
 ``python -m benchmarks.rotors`` measures in the simulator and prints the figures of docs/rotors.md. The results do not
 depend on the machine's speed, and are the same everywhere.

@@ -1,4 +1,4 @@
-"""Growing numbers of proxies and observers on one host, until it is overloaded; and the cost of each."""
+"""Add proxies and observers to one host until it is overloaded, and measure the cost of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A diagram of delays and processor time over the number of proxies and observers. Imports matplotlib when used."""
+"""Draw delays and processor time over the number of proxies and observers. Matplotlib is imported when used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pilot's application with a processor that takes 200 ms a frame, on its own thread as by default."""
+"""Run the pilot's application with a callback that takes 200 ms a frame, on its own thread as by default."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated drones over the network, each flown by its own controller, with users that fail."""
+"""Measure simulated drones over the network, each flown by its own controller, while users fail."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""Several drones, each flown by its own controller from one process; finally all are abandoned in the air.
+"""Fly several drones from one process, each by its own controller, and finally abandon all of them in the air.
 
 ::
 
     skyloop sim --drones 10 --name drone --world empty --option cameras=front --option width=64 --option fps=10
     python -m benchmarks.swarm_flight "drone*" --seconds 60
 
-Measured are the delay of each command from sending until the driver has it, the delay of feedback, the number of
-frames, unwanted failsafe steps, and at the end, when the pilot's connections close in flight, the time until each proxy
-makes its drone hover, and whether it lands.
+It measures the delay of each command until the driver has it, the delay of feedback, the number of frames, and needless
+failsafe steps. At the end the pilot's connections close in flight, and it measures how soon each proxy makes its drone
+hover, and whether it lands.
 
 It exits with 1 if a failsafe was missed after the drones were abandoned in the air.
 """

@@ -1,4 +1,4 @@
-"""The processes of ``benchmarks.swarm``: the simulation, users that fly, observers, and a witness of failsafes."""
+"""The processes of ``benchmarks.swarm``: the simulation, users that fly, observers, and one that records failsafes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The targets of the delays with other applications connected, and whether a run held them."""
+"""Targets for the delays with other applications connected, and checks of a run against them."""
 
 from __future__ import annotations
 

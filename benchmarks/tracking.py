@@ -1,8 +1,8 @@
-"""``python -m benchmarks.tracking``: our trackers beside OpenCV's weight-free ones, on the same images.
+"""Compare our trackers with OpenCV's weight-free ones on the same images: ``python -m benchmarks.tracking``.
 
-Success is the share of images with the target in view whose box overlaps the true one by half or more; precision is the
-share with centres at most 20 pixels apart. A tracker that reports a loss while the target is in view fails in both.
-Each tracker has one core, and its processor time is counted.
+Success is the fraction of images with the target in view in which the box overlaps the true one by half or more;
+precision is the fraction with centres at most 20 pixels apart. A loss reported while the target is in view counts
+against both. Each tracker has one core, and its processor time is counted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A recorded film as an array, and its hand-labelled boxes."""
+"""Load a recorded film as an array, with its hand-labelled boxes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Image sequences with known boxes, drawn from a seed: something textured that moves over a textured background.
+"""Draw image sequences with known boxes from a seed: a textured object that moves over a textured background.
 
-Also a film seen by a camera that pans and zooms: the film's own pixels and labels, with a known motion.
+Also show a film as a camera that pans and zooms would see it, with the film's own pixels and labels.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""``python -m benchmarks.tracking_street``: the meaning of the long-term tracker's scores, fitted and validated.
+"""Fit and validate the confidence of the long-term tracker's scores: ``python -m benchmarks.tracking_street``.
 
-Figures of the simulator's outdoor worlds, seen by a camera that circles them, with their true boxes. The fit is
-monotone, from the score to the share of boxes that overlap the true one by half or more, on some seeds; the table is
-from others.
+A camera circles figures of the simulator's outdoor worlds, whose true boxes are known. On some seeds a monotone
+function is fitted from the score to the fraction of boxes that overlap the true one by half or more; the table is from
+other seeds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The cost of each sample, from ``benchmarks.scale`` and ``network``, and the needs of a fleet at those costs."""
+"""Derive the cost of each sample from ``benchmarks.scale`` and ``network``, and the needs of a fleet from that."""
 
 from __future__ import annotations
 

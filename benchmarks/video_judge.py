@@ -1,4 +1,4 @@
-"""The quality of arriving pictures, in any contender's application. Needs NumPy alone."""
+"""Judge the quality of arriving images in any contender's application. Needs only NumPy."""
 
 from __future__ import annotations
 

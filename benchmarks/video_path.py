@@ -1,4 +1,4 @@
-"""``python -m benchmarks.video_path``: video over the uplinks of mobile networks, replayed between two hosts."""
+"""Measure video over mobile uplinks that are replayed between two hosts: ``python -m benchmarks.video_path``."""
 
 from __future__ import annotations
 

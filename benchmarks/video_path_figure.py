@@ -1,4 +1,4 @@
-"""A diagram of the newest picture's age over the path's capacity. Imports matplotlib when used."""
+"""Draw the newest image's age over the path's capacity. Matplotlib is imported when used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A detector that runs anywhere, and a controller that turns towards its detections.
+"""Run a detector on any host, and a controller that turns towards its detections.
 
 skyloop proxy sim:// --name alpha                                             # on the host of the drone
 skyloop process examples/detector_on_another_host.py:Detector --drone alpha   # on another, as often as you like
@@ -32,7 +32,7 @@ class Detector:
 
 
 class Face(skyloop.Controller):
-    """Turns on the spot until a marker is in the middle of the image."""
+    """Turns on the spot until a marker is in the centre of the image."""
 
     processors = ("detector",)
     result_max_age_s = 0.5  # older results are skipped and counted

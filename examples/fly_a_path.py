@@ -15,7 +15,7 @@ from skyloop.control.rehearsal import Radio, rehearse
 
 
 def helix(t: float) -> NDArray[np.float64]:
-    """Two turns of 0.8 m radius, 0.6 m up; any function of the time [s] is a path. World axes [m]."""
+    """Climb 0.6 m in two turns of 0.8 m radius. Any function of time [s] is a path. World axes [m]."""
     angle = 2 * np.pi * t / 12
     return np.array([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.8 + 0.6 * t / 24])
 

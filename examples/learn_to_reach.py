@@ -1,6 +1,6 @@
-"""Teach a drone to fly to a place: the cross-entropy method on 64 simulated drones at once, a linear policy.
+"""Teach a linear policy to fly to a place by the cross-entropy method, on 64 simulated drones at once.
 
-Run it: python examples/learn_to_reach.py --rounds 12 (extra [gym]). It prints the growing mean return.
+Run it: python examples/learn_to_reach.py --rounds 12 (extra [gym]). It prints the mean return of each round.
 """
 
 import argparse

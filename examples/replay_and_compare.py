@@ -1,4 +1,4 @@
-"""Record a flight, replay it to an old and a changed controller, and print what they do differently.
+"""Record a flight, replay it to an old and a changed controller, and print how their commands differ.
 
 python examples/replay_and_compare.py            # into a new temporary folder
 python examples/replay_and_compare.py flights    # into your own folder; needs the extra [record]
@@ -40,7 +40,7 @@ def main(into: str = "", seconds: float | str = 10.0) -> None:
         print("flown:", Face(drone, gain=1.5).run(seconds=float(seconds)))
         drone.land()
 
-    # All the same images, as fast as each controller takes them: their commands are recorded, and nothing flies.
+    # Both controllers get the same images, as fast as they process them. Their commands are recorded; nothing flies.
     for path, gain in ((old, 1.5), (new, 2.5)):
         with (
             skyloop.connect(f"replay://{flight}?speed=max") as drone,

@@ -1,4 +1,4 @@
-"""Several people, one drone: a pilot, any number of observers, and a colleague who asks for a turn.
+"""Share one drone between a pilot, any number of observers, and a colleague who asks for a turn.
 
 skyloop sim --name alpha
 python examples/shared_drone.py alpha pilot      # in one terminal: flies, and hands over when asked

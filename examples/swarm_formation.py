@@ -1,4 +1,4 @@
-"""One program, several drones: they take off together, fly in a V, in a circle, and behind a leader.
+"""Fly several drones from one program: take off together, fly a V and a circle, and follow a leader.
 
 skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/swarm_formation.py "drone*"

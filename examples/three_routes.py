@@ -1,4 +1,4 @@
-"""Three drones with a route each: check the routes, fly them at the same time, and land.
+"""Check a route for each of three drones, fly all of them at the same time, and land.
 
 skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/three_routes.py "drone*"

@@ -1,4 +1,4 @@
-"""Several "hosts" on one machine, each with a network, a name and optionally a separate clock, and bad links between.
+"""Create several "hosts" with their own network, name and clock on one machine, joined by bad links.
 
 :class:`~benchmarks.hosts.namespaces.Lab` makes them from the kernel's namespaces; they end with the process that made
 them, however it ends. :class:`~benchmarks.hosts.path.Path` is a link that loses, delays and reorders, for every

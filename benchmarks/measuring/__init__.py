@@ -1,4 +1,4 @@
-"""Measuring delays: one contract for Skyloop, the bare hand-over and other libraries, in turns in one run.
+"""Measure the delays of Skyloop, a bare transfer and other libraries by one contract, in turns in one run.
 
 Interpreters with only NumPy and one of those libraries import ``contract``, ``schedule``, ``waypoints`` and
 ``workers``.

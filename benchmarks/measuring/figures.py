@@ -1,4 +1,4 @@
-"""The paper's figures 3, 4 and 5 from our results, as PNG and SVG. Needs matplotlib, imported when used."""
+"""Draw the paper's figures 3, 4 and 5 from our results, as PNG and SVG. Matplotlib is imported when used."""
 
 from __future__ import annotations
 

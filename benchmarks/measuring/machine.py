@@ -1,4 +1,4 @@
-"""A process's use of this machine."""
+"""Measure how much of this machine a process uses."""
 
 from __future__ import annotations
 

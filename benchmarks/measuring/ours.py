@@ -1,4 +1,4 @@
-"""Skyloop's own ends, those of ``skyloop bench``; see :mod:`benchmarks.measuring.contract`."""
+"""Skyloop's own ends, as in ``skyloop bench``; see :mod:`benchmarks.measuring.contract`."""
 
 from skyloop.bench import Application, Listening, Vehicle, proxy_name
 

@@ -1,4 +1,4 @@
-"""The targets of the delays, and whether a run held them."""
+"""Targets for the delays, and checks of a run against them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluates the recording of the experiment."""
+"""Evaluate the recording of the experiment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiment's figures for people: tables, diagrams, and a page with both."""
+"""Present the experiment's figures as tables, diagrams, and a page with both."""
 
 from __future__ import annotations
 

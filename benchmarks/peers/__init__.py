@@ -1,7 +1,7 @@
 """Alternatives to Skyloop, where installed: one file each, measured by the same contract.
 
-``python -m benchmarks.peers`` measures them beside Skyloop and the bare hand-over, in turns; ``--peers none`` measures
-only those two.
+``python -m benchmarks.peers`` measures them in turns with Skyloop and a bare transfer; ``--peers none`` measures only
+those two.
 """
 
 from __future__ import annotations

@@ -3,11 +3,10 @@
 python examples/behaviours/see_and_avoid.py             # in a simulated hall
 python examples/behaviours/see_and_avoid.py alpha 6     # a running proxy, 6 m ahead
 
-A custom behaviour, with its law and the technique behind it.
-
-A fuzzy controller keeps an obstacle, detected by its colour, out of the middle of the image, as in Olivares-Mendez,
-Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by cross-entropy",
-FUZZ-IEEE 2012. Here the rules map its bearing and apparent width to the sideways speed.
+This is a complete custom behaviour with its own law. A fuzzy controller keeps an obstacle, detected by its colour, out
+of the middle of the image, as in Olivares-Mendez, Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using
+fuzzy control optimized by cross-entropy", FUZZ-IEEE 2012. Here the rules map the obstacle's bearing and apparent width
+to the sideways speed.
 
 The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is their mean, weighted by the rules'
 truth; a rule's truth is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of systems and its
@@ -95,9 +94,9 @@ def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """If every variable is as in ``when``, the output is ``then``."""
+    """If every variable matches ``when``, the output is ``then``."""
 
-    when: Mapping[str, str]  #: term by variable; a variable not named can have any value
+    when: Mapping[str, str]  #: term of each variable; a variable without one may have any value
     then: float
 
 
@@ -181,11 +180,11 @@ class AvoidPhase(StrEnum):
 class AvoidSettings:
     """Speeds and distances of :class:`AvoidLaw`."""
 
-    speed_m_s: float = 0.6  #: ahead
+    speed_m_s: float = 0.6  #: forward speed
     aside_m_s: float = 0.7  #: greatest sideways speed
     close_rad: float = 0.9  #: apparent width of an obstacle at which the speed ahead is 0
-    back_share: float = 0.25  #: share of the speed for backing off when blocked
-    avoiding_rad: float = 0.15  #: avoid obstacles with a larger apparent width
+    back_share: float = 0.25  #: fraction of the speed used to back off when blocked
+    avoiding_rad: float = 0.15  #: obstacles with a larger apparent width are avoided
     passing_s: float = 2.5  #: a side stays blocked for this long after an obstacle left the image there
     yaw_gain: float = 1.5  #: [1/s]
     acceleration_m_s2: float = 2.0
@@ -203,8 +202,8 @@ class AvoidLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            distance_m: Distance to fly ahead.
-            settings: None are the defaults.
+            distance_m: Distance to fly straight ahead.
+            settings: None means the defaults.
         """
         self.settings = s = settings or AvoidSettings()
         super().__init__(SetpointLimits(acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
@@ -257,7 +256,7 @@ class AvoidLaw(VelocityLaw):
         return replace(one, left_rad=at + half, right_rad=at - half)
 
     def _share(self) -> float:
-        """Return the share of the speed ahead, which falls with the width of an obstacle ahead."""
+        """Return the fraction of the forward speed, which falls with the width of an obstacle ahead."""
         in_the_way = (one.width_rad for one in self._seen if abs(one.bearing_rad) < one.width_rad / 2 + 0.2)
         return max(0.0, 1.0 - max(in_the_way, default=0.0) / self.settings.close_rad)
 
@@ -272,7 +271,7 @@ class AvoidLaw(VelocityLaw):
 
 
 class SeeAndAvoid(Behaviour):
-    """Flies ahead for a distance at one height and yaw, past obstacles of a colour; then hovers."""
+    """Flies straight ahead at a constant height and yaw, avoids obstacles of one colour, and hovers at the end."""
 
     name = "see and avoid"
 
@@ -289,10 +288,10 @@ class SeeAndAvoid(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            distance_m: Distance to fly ahead.
+            distance_m: Distance to fly straight ahead.
             colour: Red, green, blue of the obstacles, 0 to 255.
             camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults.
+            settings: Settings of the law; None means the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the colour has no hue.
@@ -312,7 +311,7 @@ class SeeAndAvoid(Behaviour):
 
     @property
     def ahead_m(self) -> float:
-        """Distance flown ahead [m]."""
+        """Distance flown straight ahead [m]."""
         return self._avoid_law.ahead_m
 
     def look(self, frame: Frame) -> list[Shape]:
