@@ -37,7 +37,7 @@ _DIGITS: Final = 16  #: number of digits of the code's hash
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A processor's class, and a mark that distinguishes it from other code with the same name."""
+    """A processor's class, with an identifier that distinguishes it from other code of the same name."""
 
     kind: type[Any]
     mark: str  #: name of the class and a hash of the file that defines it
@@ -112,7 +112,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """Return the class with that name or, without a name, the only class with a method ``process``."""
+    """Return the class of that name or, without a name, the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -154,7 +154,7 @@ def _source(kind: type[Any]) -> bytes:
 
 _LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
-_KEPT: Final = 1024  #: number of newest results and frames kept for rates and ages
+_KEPT: Final = 1024  #: number of most recent results and frames kept to compute rates and ages
 #: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
@@ -189,7 +189,7 @@ class Settings:
     shared: bool = True  #: whether each frame goes to only one worker, instead of to all
     max_age_s: float | None = 1.0  #: skip frames older than this when their turn comes; None skips none
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
-    stuck_s: float = 2.0  #: duration of a ``process`` call after which the other workers get this one's share
+    stuck_s: float = 2.0  #: duration of a ``process`` call after which this worker's frames go to the others
 
     def __post_init__(self) -> None:
         checked_name(self.name)
@@ -238,7 +238,7 @@ class Worker:
         self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)
 
     def run(self, seconds: float | None = None) -> None:
-        """Process frames until :meth:`stop` is called or the drone closes, then leave the processor's workers.
+        """Process frames until :meth:`stop` is called or the drone closes, then unregister as a worker.
 
         Args:
             seconds: Maximum duration [s]; None for no limit.
@@ -292,11 +292,11 @@ class Worker:
             stuck = not self._ready()
             self._busy_since_s = None
             if stuck:
-                self.membership.renew()  # asks the proxy for a share again
+                self.membership.renew()  # asks the proxy for a new share
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Return whether the worker can take frames, which it can't while a call of ``process`` exceeds ``stuck_s``."""
+        """Return whether the worker can take frames, which it can't once a ``process`` call exceeds ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -340,7 +340,7 @@ class Worker:
 class Frames:
     """The newest unprocessed frame in a worker's share. A context manager that is subscribed while open.
 
-    It requests only the share's frames and follows changes of the share, so that no other frames travel over a network.
+    It requests only the frames in that share, even when the share changes, so no other frames travel over a network.
     """
 
     def __init__(
@@ -415,9 +415,9 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     processor: str
     camera: str
     processes: int = 1  #: number of workers that these statistics cover
-    part: int = 0  #: index of the worker's part of the frames; 0 for several workers
-    parts: int = 0  #: number of parts, 0 if there is none now; for several workers, how many have a part
-    workers: int = 0  #: number of workers of this processor and camera that the proxy knows
+    part: int = 0  #: index of this worker's part of the frames; 0 in statistics of several workers
+    parts: int = 0  #: number of parts, 0 if there is none now; in statistics of several workers, how many have a part
+    workers: int = 0  #: number of workers of this processor and camera that are known to the proxy
     frames: int = 0  #: number of frames in the worker's part
     results: int = 0
     dropped: int = 0  #: number of frames replaced by newer ones before the worker was ready
@@ -484,7 +484,7 @@ class Tally:
         self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # time, age [s], duration [s]
 
     def came(self) -> None:
-        """Count a frame in the worker's part. Called on the receiving thread."""
+        """Count a frame assigned to this worker. Called on the receiving thread."""
         self.frames += 1
         self._came.append(self._clock())
 

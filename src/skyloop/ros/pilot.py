@@ -1,4 +1,4 @@
-"""Control of a drone through ROS: flying by topics and services, with the authority to do so, and its parameters."""
+"""Flying a drone through ROS topics and services, which requires control authority, and access to its parameters."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
-NEAR_M: Final = 0.2  #: tolerance for a goal that has none of its own
+NEAR_M: Final = 0.2  #: tolerance for a goal that does not specify one
 WARN_AGAIN_S: Final = 5.0  #: interval between warnings of the same kind
 
 
 class Pilot:
-    """Converts messages on topics and service calls to commands. Commands need the authority.
+    """Converts messages on topics and service calls to commands. Commands require control authority.
 
     Args:
         topics: The rclpy node whose callbacks never wait, in the drone's namespace.
@@ -212,7 +212,7 @@ class Pilot:
 
 
 def _in_words_of_ros(error: SkyloopError) -> str:
-    """Return the reason, naming the equivalent services in place of Python calls."""
+    """Return the reason, with the equivalent services instead of Python calls."""
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
@@ -233,7 +233,7 @@ class Parameters:
         drone.on_event(self._on_event)
 
     def _set(self, parameters: list[Any]) -> Any:
-        """Write the values that differ. The first refusal stops this, with the proxy's reason."""
+        """Write the values that differ. Stop at the first refusal, with the proxy's reason."""
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
@@ -248,7 +248,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
     def _on_event(self, event: Event) -> None:
-        """Show a value that was written elsewhere. Runs on the drone's own thread."""
+        """Update a parameter whose value was changed elsewhere. Runs on the drone's own thread."""
         name = event.data.get("name")
         if event.kind is not EventKind.PARAMETER_CHANGED or name not in self._known:
             return

@@ -175,7 +175,7 @@ def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.f
 def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
     """Invert :func:`distort` by Newton's method; return None if there is no inverse near the optical axis."""
     straight = np.empty_like(points)
-    for first in range(0, len(points), _BLOCK):  # in blocks that keep intermediate values in the CPU cache
+    for first in range(0, len(points), _BLOCK):  # processed in blocks so that intermediate values stay in the CPU cache
         part = slice(first, first + _BLOCK)
         if (block := _undistort(points[part], distortion)) is None:
             return None

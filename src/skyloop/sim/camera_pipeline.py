@@ -42,7 +42,7 @@ class Shutter:
         self.count = 0  #: number of exposures so far, including those without an observer
 
     def due(self, now_s: float, fps: float) -> bool:
-        """Return whether to expose now. Exposures missed during a pause are not made up for."""
+        """Return whether an exposure is due. Exposures missed during a pause are not made up for."""
         if now_s < self._next_s:
             return False
         self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
@@ -65,7 +65,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether the exposure due now is worth rendering for so many frames per second (or infinitely many)."""
+        """Return whether to render the exposure that is due, if so many frames per second are wanted (may be inf)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -73,7 +73,7 @@ class Camera:
         return self._limiter.in_time(captured_ns)
 
     def finish(self, picture: NDArray[np.uint8], number: int, rates_rad_s: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Apply the sensor's flaws to an ideal image."""
+        """Apply the sensor's imperfections to an ideal image."""
         if self._effects is None or self._effects[0] is not self.model:
             self._effects = self.model, SensorEffects(self.model, self.seed)
         return self._effects[1].apply(picture, number, rates_rad_s)
@@ -159,7 +159,7 @@ class CameraPipeline(Pipeline):
             self._thread.join()
 
     def expose(self, exposures: list[Exposure]) -> None:
-        """Queue exposures. Each replaces one of the same camera that is still waiting."""
+        """Queue exposures. A new exposure replaces a waiting one of the same camera."""
         with self._changed:
             for exposure in exposures:
                 if exposure.camera in self._waiting:

@@ -31,7 +31,7 @@ FEW_PAIRS = 6
 
 @dataclass(slots=True)
 class Contacts:
-    """The contacts in a step."""
+    """The contacts during one step."""
 
     standing: set[int] = field(default_factory=set)  #: drones supported from below by something other than a drone
     #: pairs of a drone standing on another, the upper one first
@@ -44,13 +44,13 @@ class Contacts:
 class _Near:
     """Everything that is within the drones' reach until the next broad phase."""
 
-    one: Indices  #: the first drone of each pair of drones within reach; it has the lower number
+    one: Indices  #: index of the first drone in each pair of drones within reach, the lower of the two
     other: Indices  #: the second drone of each pair
     across: Floats  #: the square of the sum of the pair's radii
     upright: Floats  #: the square of the sum of the pair's half heights
     #: the solids within reach, by drone; drones that are only near a wall or the ceiling have none
     solids: dict[int, list[int]]
-    who: Indices  #: number of the drone in each pair of a drone and a solid
+    who: Indices  #: index of the drone in each pair of a drone and a solid
     what: Indices  #: number of the solid in each of these pairs
     sizes: Floats  #: sizes of the solids; see :meth:`Solids.sizes`
     moving: bool  #: whether one of these solids is moving
@@ -79,11 +79,11 @@ class Collisions:
         # Rows, because writing single numbers is faster than writing columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
-        self._free = bodies.position.copy()  # last position of each drone clear of all fixed objects
+        self._free = bodies.position.copy()  # last position at which each drone was clear of all fixed objects
         self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
         self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # step of the next broad phase
-        self._reach = np.zeros(len(parameters))  # how far each drone can move until then
+        self._reach = np.zeros(len(parameters))  # distance that each drone can move until then
         self._extra_reach = [0.0 for _ in parameters]  # additional movement caused by pushes and impacts
         self._run_broad_phase(0)
         self._next = 0
@@ -234,7 +234,7 @@ class Collisions:
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
-            # (A moving platform may overlap the drone afterwards, because it can't be clear of both.)
+            # (A moving platform may overlap the drone afterwards: the drone can't be clear of both.)
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
         self._x[drone], self._y[drone], self._z[drone] = x, y, z
@@ -243,15 +243,15 @@ class Collisions:
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a wedged drone, which can't be pushed out of one object without entering another.
 
-        Horizontally the drone returns to its last clear position. Vertically it stays free, because nothing that it is
-        wedged between supports it. There is no friction: in a narrow enough corner the pressure would grow without
-        limit and hold the drone in the air forever.
+        Horizontally the drone returns to its last clear position. Its vertical motion stays free, because the objects
+        that wedge it in don't support it. There is no friction: in a narrow enough corner the pressure would grow
+        without limit and hold the drone in the air forever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
         self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
-        # All faces are horizontal or vertical, so one of them is above or below.
+        # All faces are horizontal or vertical, so the drone is blocked from above or below.
         self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
@@ -287,7 +287,7 @@ class Collisions:
         return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
-        """Make a turning surface take the drone on it along, by friction over the whole contact disk.
+        """Rotate the drone along with the turning surface below it, by friction over the whole contact disk.
 
         With pressure p = F / πR², the torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
@@ -318,7 +318,7 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one may exceed the broad phase's reach in the remaining time."""
+        """Separate two drones; return whether one might leave the broad phase's reach in the remaining time."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()

@@ -1,4 +1,4 @@
-"""A world with drones that keeps time and is rendered, for the drones' observers (drivers and emulators)."""
+"""A world with drones, advanced in real time and rendered for the drones' observers (drivers and emulators)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Report:
 
 
 class Observer(Protocol):
-    """Callbacks of a host, called on the thread that steps the world. They must return quickly and never raise."""
+    """Callbacks for a host, called on the thread that steps the world. They must return quickly and never raise."""
 
     def report(self, report: Report) -> None: ...
 
@@ -82,14 +82,14 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Reports come on the thread that steps the world, and the cameras' frames, for ``screen``, on the rendering
-        thread. A drone has one observer: for a second one this raises UsageError.
+        Reports arrive on the thread that steps the world, and ``screen`` gets the frames on the rendering thread. A
+        drone has one observer: for a second one this raises UsageError.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
             if drone in self.observers:
-                raise UsageError(f"drone {drone} of this world is taken already")
+                raise UsageError(f"drone {drone} of this world is already taken")
             cameras = self._cameras(drone, screen, models)
             self.observers = {**self.observers, drone: (observer, cameras)}
             if self._stepper is None:
@@ -142,7 +142,7 @@ class Stepper(Protocol):
 
 
 class ReportPublisher:
-    """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
+    """Publishes reports to a host's observers and triggers the cameras that are due after each batch of steps."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Pipeline]) -> None:
         """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""

@@ -1,4 +1,4 @@
-"""Parameters of a simulated vehicle for its flight, its rotors and its instruments.
+"""Parameters that describe a simulated vehicle's flight, rotors and instruments.
 
 The defaults describe an AR.Drone 2 with its indoor hull, as far as public sources go. Values without a source are
 marked as estimates.
@@ -82,8 +82,8 @@ class RotorParameters:
     full_speed_rad_s: float  #: speed at full command
     speed_up_s: float  #: time constant of an accelerating rotor
     speed_down_s: float  #: time constant of a decelerating rotor
-    #: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. Its causes
-    #: are blade flapping and the blades' asymmetric drag.
+    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. Its
+    #: causes are blade flapping and the blades' asymmetric drag.
     rotor_drag_kg: float
     rotor_inflow_kg: float  #: the same along the rotors' axes, where air from above reduces the thrust
     body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
@@ -151,8 +151,8 @@ class VehicleParameters:
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large
-    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. It is this
-    # angle times the square of the horizontal airspeed, up to 3 m/s, caused by blade flapping and wind on the hull.
+    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. The tilt is
+    # this angle times the square of the horizontal airspeed, up to 3 m/s; blade flapping and wind on the hull cause it.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
@@ -168,8 +168,8 @@ class VehicleParameters:
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
-    # With roll and pitch set-points near level, firmware may lean against the speed: this is the deceleration per speed
-    # at a level set-point; it decreases in proportion to the tilt and is zero at the full tilt.
+    # Near level roll and pitch set-points, the firmware may lean against the motion: this is the deceleration per speed
+    # at a level set-point, which decreases in proportion to the tilt and is zero at full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
@@ -207,8 +207,8 @@ class VehicleParameters:
     restitution: float = 0.35  # fraction of the normal speed after a bounce; estimate
     friction: float = 0.5  # Coulomb friction; estimate
 
-    #: Rotors of a vehicle that is modelled down to them (``docs/rotors.md``); None models its response as a whole. With
-    #: rotors, the drag, motor time constant and hover power above have no effect; the rotors' own values count.
+    #: Rotors of a vehicle that is modelled down to them (``docs/rotors.md``); None models its response as a whole. If
+    #: there are rotors, their own values replace the drag, motor time constant and hover power above.
     rotors: RotorParameters | None = None
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A simulation's reports about its drones: their own estimates, the truth, and occurrences."""
+"""A simulation's reports on its drones: their own estimates, the true state, and occurrences."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class VehicleTruth:
 
 
 class OccurrenceKind(StrEnum):
-    """Kinds of occurrences."""
+    """Types of occurrences."""
 
     COLLISION = "collision"
     EMERGENCY = "emergency"

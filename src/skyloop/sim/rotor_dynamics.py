@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant that slower rotors get because the mixer commands them beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant for slower rotors, which the mixer commands beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays of those of all. Forces and torques are per mass and per inertia."""
+    """Constants of one drone, or arrays for all drones. Forces and torques are per mass and per inertia."""
 
     thrust: N
     idle_speed: N
@@ -188,7 +188,7 @@ def advance(
     twist: N,  # reaction of the rotors; see :func:`spin`
     motion: Sequence[N],  # velocity of the air, position and velocity in world axes
     knock: Three,  # acceleration in world axes by which contacts changed the body's velocity in the last step
-    legs: bool,  # whether any drone may be standing or lying on something that turns it onto its feet
+    legs: bool,  # whether any drone may be touching something that turns it onto its feet
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
 
@@ -217,7 +217,7 @@ def advance(
     t4 = t4 - inflow * s4 * (along + p * c.y4 - q * c.x4)
     thrust = t1 + t2 + t3 + t4
 
-    # Near the floor thrust grows by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow downwards.
+    # Near the floor, thrust grows by 1 / (1 - (R / 4h)²) [C], scaled by the downward component of the rotors' axis.
     shortfall = c.ground_effect / do.most(pz + c.rotor_offset, c.rotor_height)
     lift = thrust / (1.0 - shortfall * shortfall * do.most(r22, 0.0))
     flapping = c.rotor_drag * (s1 + s2 + s3 + s4)
@@ -260,8 +260,8 @@ def advance(
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
     """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
 
-    If the rotors can't do everything, roll and pitch come first, then the thrust per mass (at 0 the rotors stop); yaw
-    gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch take precedence, then the thrust per mass (at 0 the rotors stop);
+    yaw gets a limited share.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted

@@ -32,7 +32,7 @@ from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
-# First rows, and number, of the table of a body's state and inputs, in addition to those of BodyTable.
+# First rows of the entries that this table adds to BodyTable's, and its total number of rows.
 _TURNING, _SPEEDS, _TARGETS, _ROWS = 0, 7, 16, 29
 _AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; cosine near the vertical
 _IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %

@@ -238,7 +238,7 @@ class PlatformTable(BoardTable, kw_only=True, tag_field="kind", tag="platform"):
 
 
 class FigureTable(Named, kw_only=True, tag_field="kind", tag="figure"):
-    """The path is on the ground below the figure, and the heading is by default that of the path."""
+    """The path is on the ground below the figure, and by default the heading follows the path."""
 
     shape: Literal["person", "car"] = "person"
     path: PathTable

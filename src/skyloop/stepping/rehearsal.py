@@ -112,7 +112,7 @@ class _RehearsalDriver(SimDriver):
         self._radio = radio
         self._clock = clock
         self._random = random.Random(f"rehearsal/{radio.seed}")
-        # A separate generator, so that cameras don't change the losses of commands and feedback.
+        # Cameras use a separate generator, so that they don't change which commands and feedback are lost.
         self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
         self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap ordered by arrival time
         self._numbers = itertools.count()

@@ -58,7 +58,7 @@ class StepExecutor:
     def call(self, job: Job, interrupt: Job) -> None:
         """Queue a job and wait until it has returned; its exceptions are raised here.
 
-        After Ctrl-C ``interrupt`` is called on this thread, to make the job return.
+        If Ctrl-C is pressed, this calls ``interrupt`` on this thread to make the job return.
         """
         done = threading.Lock()
         done.acquire()
@@ -116,7 +116,7 @@ ADDRESS: Final = "this process, in step with one application"
 
 
 class SteppedServer(TransportServer):
-    """The proxy's end, which serves one client at a time. Handlers are called on the executor's thread."""
+    """The proxy's side, which serves one client at a time. Handlers are called on the executor's thread."""
 
     def __init__(self, executor: StepExecutor) -> None:
         self._executor = executor
@@ -190,7 +190,7 @@ class SteppedServer(TransportServer):
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection once; each end's handler is called after all earlier packets have been delivered."""
+        """End a connection, only once; each end's handler is called after all earlier packets have been delivered."""
         if self._client is not client:
             return
         self._client = None
@@ -257,7 +257,7 @@ class SteppedClient(TransportClient):
             self._handler.frame(header, pixels)
 
     def ended(self, reason: str) -> None:
-        """Tell the handler once that the connection has ended."""
+        """Notify the handler, only once, that the connection has ended."""
         self._handler.closed(reason)
         self._closed.set()
 

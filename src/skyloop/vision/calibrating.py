@@ -34,7 +34,7 @@ Model = Literal["pinhole", "fisheye"]
 
 LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
 GRID: Final = (8, 6)  #: number of cells across and down for measuring coverage
-_WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
+_WORST_SHARE: Final = 2.5  # views whose error exceeds this many times the median are removed ...
 _WORST_PX: Final = 0.3  # ... and above this
 _NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
@@ -337,7 +337,7 @@ def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     # Without k3: estimated from few images it is mostly noise, and it bends the image's corners, where there was no
-    # data. Lenses that need it are fisheyes.
+    # data. Lenses that need k3 are fisheye lenses.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )
@@ -360,7 +360,7 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """Return a fisheye flag. OpenCV 4 has separate ones with different values, OpenCV 5 has one set for all."""
+    """Return a fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 

@@ -25,7 +25,7 @@ Rgb = tuple[int, int, int]
 
 _HUE_DEG: Final = 16.0  # tolerance on either side of the colour's hue
 _SATURATION: Final = 0.5  # minimum saturation as a fraction of the colour's own; covers paint in light and shade
-_LEAST_SATURATION: Final = 80  # 0 to 255: a less saturated colour is too grey to distinguish
+_LEAST_SATURATION: Final = 80  # 0 to 255: less saturated colours are too grey to distinguish
 _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance
 _FARTHEST_M: Final = 8.0  # maximum distance; anything further away is more likely a patch of the same colour
@@ -36,7 +36,7 @@ _LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
 _SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
 _ABOVE_PX: Final = 6  # height of the area above a pole that is searched for something hiding its top
 _COLOURFUL: Final = 100  # saturation from which a pixel counts as colourful, 0 to 255
-_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece, unlike two overlapping poles
+_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece; overlapping poles have less
 
 
 class ColourMask:
@@ -96,7 +96,7 @@ class BlobDetector:
 
         Args:
             colour: Red, green, blue, 0 to 255.
-            least_px: Ignore areas narrower or lower than this [px].
+            least_px: Ignore areas narrower or shorter than this [px].
 
         Raises:
             UsageError: The colour is invalid, or too grey to have a hue.
@@ -332,7 +332,7 @@ class PoleDetector:
 
 
 def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Return the top of a leaning pole, measured from the left, and its width; None if it is not in one piece."""
+    """Return the horizontal position of a leaning pole's top and its width; None if the pole is not in one piece."""
     rows = np.arange(len(shape))
     first, last = shape.argmax(axis=1), shape.shape[1] - 1 - shape[:, ::-1].argmax(axis=1)
     whole = shape.any(axis=1) & (shape.sum(axis=1) == last - first + 1)

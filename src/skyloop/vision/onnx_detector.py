@@ -43,7 +43,7 @@ class Layout(StrEnum):
     LISTS = "lists"  #: boxes (n, 4) in pixels, scores (n) and labels (n): torchvision, RT-DETR with its postprocessor
 
 
-#: Layouts that take the whole image stretched instead of letterboxed.
+#: Layouts for which the whole image is stretched instead of letterboxed.
 STRETCHED: Final = frozenset({Layout.RT_DETR, Layout.DETR, Layout.RF_DETR})
 #: Layouts that take BGR from 0 to 255 instead of RGB from 0 to 1.
 RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
@@ -79,7 +79,7 @@ def describe(outputs: Outputs) -> str:
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
     """Recognise a network's layout from its outputs by name, from one run on any image; width and height of its input.
 
-    FileFormatError if they fit none of the families, or several. ``classes`` is the number of known class names.
+    FileFormatError if they fit none of the families, or more than one.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -180,7 +180,7 @@ def _unknown(outputs: Outputs) -> FileFormatError:
 
 
 def _single(outputs: Outputs, layout: Layout) -> Array:
-    """Return the only output for one image; if the first one fits, ignore others (of a training head)."""
+    """Return the only output for one image; ignore further outputs (of a training head) if the first one fits."""
     values = next(iter(outputs.values()), None)
     if values is None or values.ndim != 3 or values.shape[0] != 1:
         raise FileFormatError(
@@ -205,7 +205,7 @@ def _numbers(values: Array) -> Floats:
 
 
 def _pair(outputs: Outputs) -> tuple[Array, Array]:
-    """Tell boxes from logits, by name if both could be boxes."""
+    """Distinguish boxes from logits, by name if both could be boxes."""
     shapes = [value.shape for value in outputs.values()]
     if len(shapes) != 2 or any(len(s) != 3 or s[0] != 1 for s in shapes) or shapes[0][1] != shapes[1][1]:
         raise _unknown(outputs)
@@ -258,7 +258,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's best class. NaN counts as the best, so that its row is dropped later."""
+    """Take each row's best class. NaN counts as the best score, so that its row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)
@@ -311,12 +311,12 @@ def layout_named(name: str | Layout | None) -> Layout | None:
         raise UsageError(f"layout is {name!r} and must be one of {known}") from None
 
 
-_GREY: Final = 114  # padding of letterboxed images, as YOLO networks are trained with
+_GREY: Final = 114  # grey level of the padding of letterboxed images, the same as in YOLO's training
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's mean, for RF-DETR
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
 _SIDE: Final = 640  # default side for a network that takes any size
 _MOST_SIDE: Final = 4096  # maximum side of an input image [px]
-_MOST: Final = 1000  # number of best boxes to compare with one another
+_MOST: Final = 1000  # maximum number of best boxes that are compared with each other
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
@@ -407,7 +407,7 @@ class OnnxDetector:
         return self._detections(found, scale, shift, (pixels.shape[1], pixels.shape[0]))
 
     def _fit(self, pixels: Image) -> tuple[Image, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the image fitted to the input size, its scale and its corner, the last two as x and y."""
+        """Return the image fitted to the input size, its scale (x, y) and the position of its corner (x, y)."""
         width, height = self.size
         rows, columns = pixels.shape[:2]
         if self.layout in STRETCHED:

@@ -285,7 +285,7 @@ _ARM_M = 0.16
 _ROTOR_M = 0.10
 _FEET_M = 0.06  # distance of the feet below the body's origin
 _DARK: Rgb = (46, 48, 52)
-_POLE_M = 12.0  # length of the stand's pole, which goes through the floor and is hidden below it
+_POLE_M = 12.0  # length of the stand's pole, which extends through the floor and is hidden below it
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
@@ -390,7 +390,7 @@ _PAPER = 235
 
 
 def draw_card(pattern: MarkerPattern) -> tuple[Image, tuple[float, float, float, float]]:
-    """Draw a marker with its margin, BGR; return also the visible left, top, right, bottom in fractional texels.
+    """Draw a marker with its margin, BGR; also return the visible left, top, right, bottom in fractional texels.
 
     The black square takes up ``pattern.size_m`` of the card's ``card_size_m``, accurate to a fraction of a texel.
     """

@@ -1,9 +1,9 @@
 """The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
 
-The first step finds the quad at each sample of the image, and the second colours each pixel once
+The first step determines which quad is at each sample of the image, and the second colours each pixel once
 (``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
-coloured and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens:
-nothing is resampled, and textures stay sharp.
+coloured and averaged, for smooth silhouettes. With distortion, the lens determines where the samples are, so nothing is
+resampled and textures stay sharp.
 
 :class:`PlainPainter` does this with NumPy and OpenCV. ``compiled`` does the same arithmetic in loops compiled by Numba,
 several times faster, once they are ready. Both give the same image, bit by bit, for the same scene, state, pose and
@@ -43,7 +43,7 @@ class Quality(Enum):
 def use_one_core() -> None:
     """Restrict OpenCV to the calling thread in this whole process.
 
-    Images this small gain nothing from more threads, and OpenCV's workers would take up cores that proxies and
+    Images this small don't benefit from more threads, and OpenCV's workers would occupy cores that proxies and
     applications need. A process that only simulates calls this once at its start.
     """
     cv2.setNumThreads(1)
@@ -62,8 +62,8 @@ def dimmed(picture: Image, light: float) -> Image:
 class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
-    :class:`SensorEffects` adds the latter. The renderer reuses buffers, so use it from one thread at a time. Several
-    renderers can share a scene. Without a compiler it never draws with compiled code.
+    :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so use it from one thread at a
+    time. Several renderers can share a scene. Without a compiler it never draws with compiled code.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class PlanarRenderer:
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
-    """Precompute a lens's values, so that its first image needn't wait: 0.2 s for 960×720 pixels with distortion.
+    """Precompute a lens's values to save time on its first image: 0.2 s for 960×720 pixels with distortion.
 
     They are kept for all renderers in the process.
     """
@@ -206,7 +206,7 @@ class SensorEffects:
 def _gain(model: CameraModel) -> Image | None:
     """Return exposure and vignetting in steps of 1/128; None if there is neither.
 
-    Vignetting is like cos⁴: it grows with the square of the distance from the centre.
+    Like a cos⁴ falloff, vignetting grows with the square of the distance from the centre.
     """
     if model.exposure_gain == 1.0 and model.vignetting == 0.0:
         return None
