@@ -154,7 +154,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
 
 
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
-    """Many drones in one simulation, which is many times faster than a simulation for each.
+    """Many drones in one simulation, which is many times faster than one simulation per drone.
 
     Like :class:`TaskEnv`, with a leading axis; a finished episode starts over in the next step
     (``AutoresetMode.NEXT_STEP``).

@@ -256,7 +256,7 @@ class Following(Reaching):
         self._rates = np.zeros((drones, 3))
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Move the targets, then do the base class's step."""
+        """Move the targets, then perform the base class's step."""
         self._walk(self.age + 1)
         return super().step(actions)
 
@@ -325,7 +325,7 @@ class Racing(Reaching):
         self.headings = np.arctan2(normals[:, 1], normals[:, 0])
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Do the base class's step, rewarding each gate with 1 and the approach to the next one."""
+        """Perform the base class's step, adding 1 for each gate and the distance gained towards the next one."""
         before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
         rewards, done, over, infos = super().step(actions)
         nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)

@@ -187,7 +187,7 @@ class Settings:
     code: str  #: identifier of the code, the same for all workers
     camera: str | None = None  #: name of the camera; None for the vehicle's first one
     shared: bool = True  #: whether each frame goes to only one worker, instead of to all
-    max_age_s: float | None = 1.0  #: skip frames older than this when their turn comes; None skips none
+    max_age_s: float | None = 1.0  #: maximum age of a frame when its turn comes; None for no limit
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
     stuck_s: float = 2.0  #: duration of a ``process`` call after which this worker's frames go to the others
 
@@ -244,7 +244,7 @@ class Worker:
             seconds: Maximum duration [s]; None for no limit.
 
         Raises:
-            NameTakenError: Different code has taken the name since, which is possible while the proxy is away.
+            NameTakenError: Different code took the name in the meantime, which can happen while the proxy is away.
             RefusedError: The proxy refuses this worker for a different reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
@@ -254,7 +254,7 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # returns its memory to the proxy while waiting for the next
+                    del arrival  # frees its memory for the proxy while waiting for the next
         finally:
             self.membership.close()
 
@@ -371,11 +371,11 @@ class Frames:
 
     @property
     def dropped(self) -> int:
-        """Number of the share's frames that were replaced by newer ones."""
+        """Number of frames in the share that were replaced by newer ones."""
         return self._buffer.dropped
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """Take the newest frame; None if none arrives within ``timeout_s`` [s]."""
+        """Return the newest frame, or None if none arrives within ``timeout_s`` [s]."""
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
@@ -475,7 +475,7 @@ def together(found: Iterable[Status]) -> Status | None:
 
 
 class Tally:
-    """Counters of a worker. One thread counts frames, another one results; any thread can read them."""
+    """Counters of a worker. One thread counts frames and another counts results; any thread can read the counters."""
 
     def __init__(self, clock: Clock) -> None:
         self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0

@@ -56,7 +56,7 @@ class Pilot:
         self._log = topics.get_logger()
         self._lock = threading.Lock()
         self._under_way: list[str] = []  # services that are waiting for the drone
-        # Keep only the newest sample, from both reliable and best-effort publishers.
+        # Accept reliable and best-effort publishers alike, and keep only the newest sample.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
@@ -217,10 +217,10 @@ def _in_words_of_ros(error: SkyloopError) -> str:
 
 
 class Parameters:
-    """Declares the drone's parameters on a node, writes values set through ROS, and shows changes made elsewhere.
+    """Declares the drone's parameters on a node, writes values set through ROS, and mirrors changes made elsewhere.
 
     ``node``: the rclpy node. Setting a parameter waits for the drone's proxy. ``drone``: the drone, connected as a
-    pilot, because writing needs the authority.
+    pilot, because writing requires control authority.
     """
 
     def __init__(self, node: Any, drone: Drone) -> None:

@@ -181,7 +181,7 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Hover at a flying drone's new position without any estimate of the wind there."""
+        """Make a flying drone hover at its new position, with its estimate of the wind reset."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 

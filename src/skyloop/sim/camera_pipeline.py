@@ -20,8 +20,8 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that selects
-#: frames by its own count always finds one in time.
+#: Factor by which more frames are rendered than used if fewer are used than the camera takes, so that a consumer that
+#: selects frames by its own count always finds one in time.
 RATE_MARGIN: Final = 1.25
 
 
@@ -118,7 +118,7 @@ class Pipeline(ABC):
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames from these cameras. After this returns, no other thread delivers one."""
+        """Stop delivering frames from these cameras. After this returns, no other thread delivers frames."""
         with self._handing:
             for camera in cameras:
                 camera.gone = True
@@ -227,7 +227,7 @@ def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
 def expose(
     camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
-    """Expose a camera to a state. The frame is due after the camera's latency."""
+    """Return an exposure of a state by a camera. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone
     pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
     due_ns = captured_ns + nanoseconds(model.latency_s / speed)

@@ -21,8 +21,8 @@ from skyloop.sim.world import Vec3
 
 _STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce, or nothing would come to rest
 _PASSES = 6  # number of attempts per step to push a drone out of solids
-_TOUCH_M = 1e-9  # maximum overlap that counts as touching: rounding leaves some that no push removes
-#: Number of steps between broad phases. With few drones one costs as much but leaves fewer pairs to check.
+_TOUCH_M = 1e-9  # maximum overlap that counts as touching, because rounding leaves some that pushing can't remove
+#: Number of steps between broad phases. With few drones, each costs as much but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
 _SLACK_M = 0.03  # extra reach in a broad phase, to allow for drones being pushed
 #: Maximum number of pairs that are faster to check one at a time.
@@ -34,7 +34,7 @@ class Contacts:
     """The contacts during one step."""
 
     standing: set[int] = field(default_factory=set)  #: drones supported from below by something other than a drone
-    #: pairs of a drone standing on another, the upper one first
+    #: pairs of drones in which one stands on the other, upper one first
     upon: list[tuple[int, int]] = field(default_factory=list)
     #: drone, speed along the normal [m/s], and the name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
@@ -69,14 +69,14 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # for the centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # for hull centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
         self._feet = self._hull[2]
-        # Rows, because writing single numbers is faster than writing columns.
+        # Row views, because writing single numbers to rows is faster than to columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # last position at which each drone was clear of all fixed objects
@@ -207,7 +207,7 @@ class Collisions:
         return sorted(found)
 
     def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
-        """Push a drone out of solids; return whether it may exceed the broad phase's reach in the remaining time."""
+        """Push a drone out of solids; return whether it might leave the broad phase's reach in the remaining time."""
         bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
         x, y, z = start = bodies.position[:, drone].tolist()
         height, climb = z, float(self._vz[drone])

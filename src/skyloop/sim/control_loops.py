@@ -119,7 +119,7 @@ def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> 
 
 
 _REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehicle
-_HELD_M = 0.25  # distance behind its descent from which a landing drone counts as held
+_HELD_M = 0.25  # minimum distance behind its descent at which a landing drone counts as held
 _HELD_CLIMB_M_S = 0.15  # maximum climb rate of a held drone; a faster one is still on its way
 _HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
 _HELD_REGAIN = 4.0  # factor by which the lag shrinks faster; otherwise the drone would drop when released
@@ -279,7 +279,7 @@ class ControlLoops:
         pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
-        if self._any_level_brake:  # drones flown by attitude lean against their speed
+        if self._any_level_brake:  # drones under attitude control lean against their motion
             brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)

@@ -45,7 +45,7 @@ class Fields:
         numbers = Struct(f"{count}d")
         #: one function per drone that returns the drone's numbers
         self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
-        #: one function per drone that replaces its numbers; it takes as many numbers
+        #: one function per drone that replaces its numbers with the same number of values
         self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
 
 

@@ -68,7 +68,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held by the stepping thread: an ending one may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
@@ -97,7 +97,7 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; any other than the attached one is ignored. The last one stops the world.
+        """Stop reporting to an observer; do nothing if it is not the attached one. The last one stops the world.
 
         No report is running when this returns.
         """
@@ -153,7 +153,7 @@ class ReportPublisher:
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish the reports and exposures that are due for the state at a time on the observers' clock."""
+        """Publish the reports and exposures that are due at a time on the observers' clock."""
         simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
             if occurrence.drone in observers:
@@ -190,7 +190,7 @@ class ReportPublisher:
 
 
 class _RealTimeStepper:
-    """A world in real time: one thread steps it and publishes reports, another one renders."""
+    """Runs a world in real time: one thread steps it and publishes reports, and another one renders."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
@@ -225,7 +225,7 @@ class _RealTimeStepper:
         self._slowness = SlownessWatch(monotonic_ns())
         self._begun_s = self._simulation.time_s
         try:
-            least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs even steps
+            least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs evenly timed steps
             while not self._stop.wait(max(self._pacer.run_due(), least_s)):
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))

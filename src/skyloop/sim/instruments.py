@@ -187,7 +187,7 @@ class Instruments:
         self._pressure_pa = 0.0
         self._below_m = math.inf
         self._range_m: float | None = None
-        self._turned = (0.0, 0.0, 0.0, 0.0)  # since the last flow sample, about forward and left: true, then gyro
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # about forward and left since the last flow: true, gyro
         self._first = -1
 
     def read(

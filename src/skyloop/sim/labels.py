@@ -27,7 +27,7 @@ from skyloop.sim.world import FigureTarget, TargetState, World
 
 CLASS_NAMES = ("person", "car", "box")  #: label classes; those of boards and platforms are not included
 _CLEAR_M = 0.35  # minimum distance between a camera and solids
-_LONGEST_STEP_S = 20.0  # maximum time between two images of ``pictures``; tracks keep only 60 s
+_LONGEST_STEP_S = 20.0  # maximum time between two images from ``pictures``; tracks keep only 60 s
 
 
 @dataclass(frozen=True, slots=True)

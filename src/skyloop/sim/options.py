@@ -61,9 +61,9 @@ class SimOptions:
 
 
 _LONGEST_RUN_STEPS = 25  # maximum number of steps per call when running in real time
-SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation is too slow,
-SLOW_NS = 5 * NS_PER_S  #: the time over which that is measured,
-SLOW_AGAIN_NS = 60 * NS_PER_S  #: and the interval between warnings
+SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation counts as too slow
+SLOW_NS = 5 * NS_PER_S  #: time over which the speed is measured
+SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
 
 
 class Pacer:
@@ -114,7 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Return when the simulation reached, or will reach, a time since this pacer's start, on the clock."""
+        """Return the clock time at which the simulation reached, or will reach, a time since this pacer's start."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:
@@ -122,7 +122,7 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure."""
+    """Detects that the computer is too slow for a simulation, from the time that its :class:`Pacer` skipped. Pure."""
 
     def __init__(self, now_ns: int) -> None:
         self._since_ns = now_ns

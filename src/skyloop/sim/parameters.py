@@ -31,7 +31,7 @@ Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tu
 class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
-    ``noise`` is the standard deviation of a sample. ``bias`` is that of the error at the start of a flight, which then
+    ``noise`` is the standard deviation of a sample, and ``bias`` that of the initial error of a flight, which then
     wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
     """
 
@@ -147,7 +147,7 @@ class VehicleParameters:
     mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
-    linear_drag_per_s: float = 0.45  # together with the next one: 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
+    linear_drag_per_s: float = 0.45  # with the next value, gives 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large

@@ -1,4 +1,4 @@
-"""Formulas of the rotor-level model, both for the numbers of one drone and for arrays of all drones. Pure.
+"""Formulas of the rotor-level model, which work for the numbers of one drone and for arrays of all drones. Pure.
 
 Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give the
 same bits for numbers and arrays.
@@ -202,7 +202,7 @@ def advance(
     knock_x, knock_y, knock_z = knock
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(w, x, y, z)
 
-    # The air along the body's axes and, at each rotor, along its own: a rotor's force follows [M], less inflow [S].
+    # Airspeed along the body's axes and, at each rotor, along its axis: a rotor's force follows [M], less inflow [S].
     east, north, up = vx - air_x, vy - air_y, vz - air_z
     ahead = r00 * east + r10 * north + r20 * up
     aside = r01 * east + r11 * north + r21 * up
@@ -261,7 +261,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
     """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
 
     If the rotors can't do everything, roll and pitch take precedence, then the thrust per mass (at 0 the rotors stop);
-    yaw gets a limited share.
+    yaw gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -296,7 +296,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
 
 
 def electric_power(c: Constants, speeds: Four) -> N:
-    """Return the battery power for the rotors at these speeds and the electronics [W]."""
+    """Return the battery power for the electronics and for the rotors at these speeds [W]."""
     s1, s2, s3, s4 = speeds
     return (s1 * s1 * s1 + s2 * s2 * s2 + s3 * s3 * s3 + s4 * s4 * s4) * c.shaft_power + c.electronics_power
 

@@ -71,7 +71,7 @@ class Solids:
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
         """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
 
-        Moving solids stay within theirs for so many seconds, and a hull of that radius touches a box only if their
+        Moving solids stay within their boxes for ``seconds``, and a hull of ``radius_m`` touches a solid only if their
         bounding boxes overlap. (To find the distance between a hull and a turned box's corner, treat the hull as a
         square turned the same way.)
         """
@@ -105,14 +105,15 @@ class Solids:
         return found
 
     def sizes(self, numbers: Indices, hulls: Floats) -> Floats:
-        """Return half the sizes of solids with hulls (3, m) around them, shape (3, m)."""
+        """Return the half sizes of solids enlarged by hulls (3, m), shape (3, m)."""
         grown: Floats = self._half[:, :, 0].take(numbers, axis=1) + hulls
         return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance of drones at points (3, m) to the nearest solid, wall or ceiling, (m,).
 
-        It never exceeds the true distance, and is negative inside a solid.
+        It never exceeds the true distance, and is negative inside a solid. ``hulls`` are radius, radius, half height,
+        (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
         nearest: Floats = room.min(axis=0)
@@ -155,7 +156,7 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite without one.
+        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite if none.
 
         The distance is 0 if the point is below the floor.
         """
@@ -231,8 +232,8 @@ Indices = NDArray[np.intp]
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
     """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
 
-    Boxes extend from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one of a pair is among
-    the first ``movable`` ones. The pairs' lower and higher numbers are in ascending order.
+    Boxes extend from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one box of each pair is
+    among the first ``movable`` boxes. Pairs are sorted by their lower, then their higher number.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

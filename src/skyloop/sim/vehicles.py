@@ -31,7 +31,7 @@ AR_DRONE = VehicleParameters(
     level_brake_per_s=0.303,
 )
 
-#: A 5-inch racing quadrotor with a four-cell battery: 4.6 times its weight in thrust.
+#: A 5-inch racing quadrotor with a four-cell battery and a maximum thrust of 4.6 times its weight.
 RACER = VehicleParameters(
     mass_kg=0.75,  # [L]
     radius_m=0.19,  # half the diagonal between the rotors, 0.125 m [L], plus a rotor's radius
@@ -98,7 +98,7 @@ IRIS = VehicleParameters(
     ),
 )
 
-#: A Crazyflie 2: 1.7 times its weight in thrust.
+#: A Crazyflie 2, with a maximum thrust of 1.7 times its weight.
 CRAZYFLIE = VehicleParameters(
     mass_kg=0.028,  # [F]
     radius_m=0.069,  # 46 mm to the rotors' axes [F] plus a rotor's radius

@@ -393,7 +393,7 @@ class Wind:
 class Light:
     """Slowly changing daylight, as under passing clouds: between 1 - ``amplitude`` and 1 times the full brightness.
 
-    It is the sum of two sines, with ``period_s`` and about a third of it, and phases from the world's seed.
+    It sums two sines with periods of ``period_s`` and about a third of that, and phases from the world's seed.
     """
 
     amplitude: float = 0.0

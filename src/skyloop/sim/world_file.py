@@ -109,7 +109,7 @@ class WindTable(_Table, kw_only=True):
 
 
 class VariedTable(Named, kw_only=True):
-    """An object that the seed may move up to this far from its position in the file."""
+    """An object with the maximum distance that the seed may move it from its position in the file."""
 
     vary: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 0.0, 0.0)
     vary_yaw_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 0.0
@@ -421,7 +421,7 @@ def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room
     """Return the pose of an object on one of the room's faces.
 
     On a wall, ``along`` is x (north, south) or y (east, west), and ``other`` is the height. On the floor and the
-    ceiling they are x and y, and the image's up points east.
+    ceiling they are x and y, and the top of the image points east.
     """
     half_x, half_y, height = room.size_m[0] / 2, room.size_m[1] / 2, room.size_m[2]
     gap = _WALL_GAP_M

@@ -83,7 +83,7 @@ class StepExecutor:
             raise raised[0]
 
     def run_pending(self) -> None:
-        """Run all posted jobs, including those they post themselves. Call this only on the executor's thread."""
+        """Run all posted jobs, including jobs that they post. Call this only on the executor's thread."""
         while True:
             try:
                 job = self._jobs.get_nowait()
@@ -205,7 +205,7 @@ class SteppedServer(TransportServer):
 
 
 class SteppedClient(TransportClient):
-    """The client's end."""
+    """The client's side of the transport."""
 
     def __init__(self, server: SteppedServer, executor: StepExecutor, peer: Peer, handler: ClientHandler) -> None:
         self.peer = peer
@@ -291,7 +291,7 @@ class StepScheduler(Scheduler):
         source: Callable[[], StepSource | None],
         begin_ns: int,
     ) -> None:
-        """Set up simulated time; ``source`` returns the source of samples or steps, None before it exists."""
+        """Set up simulated time; ``source`` returns the source of samples or steps, or None if there is none yet."""
         super().__init__(clock)
         self._time = clock
         self._executor = executor

@@ -32,9 +32,9 @@ from skyloop.vision.tracking import (
     patch,
 )
 
-_VERIFIED: Final = 0.45  # a tracked box counts as verified from this similarity to the memory
+_VERIFIED: Final = 0.45  # minimum similarity to the memory for a tracked box to count as verified
 _SURE: Final = 0.6  # minimum similarity for the appearance to be learned
-_FOUND: Final = 0.55  # a lost target is tried at places of at least this similarity
+_FOUND: Final = 0.55  # minimum similarity for a place to be tried when the target is lost
 _UNLIKE_OTHERS: Final = 0.15  # required lead in similarity over all other places and known look-alikes
 _LOOK_ALIKE: Final = 0.4  # minimum similarity for anything near the target to be remembered as a look-alike
 _PATIENCE: Final = 10  # number of images without verification before the whole image is searched
@@ -234,8 +234,8 @@ class Appearance:
 def colours(image: Image, box: Box) -> Floats:
     """Return the colours of a box's upper and lower half, (5, 6) float32: L, a, b of each (CIELAB).
 
-    One row for each of five strips, each a third of the box's width, from left to right: a person with an arm or a leg
-    stretched out is not in the middle of the box, which then shows the background. The image is BGR or grey.
+    There is one row for each of five strips from left to right, each a third of the box's width: the middle of the box
+    shows only background if a person has an arm or a leg stretched out. The image is BGR or grey.
     """
     cv = opencv("comparing colours")
     x, y, width, height = box

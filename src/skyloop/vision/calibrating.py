@@ -130,7 +130,7 @@ class Board:
             raise UsageError(
                 f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, and must be 20 to 2000"
             )
-        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # at which a square has exactly its size
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # resolution at which squares are exactly to size
         with replacing(file) as part:
             if file.suffix.lower() == ".pdf":
                 Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)

@@ -69,7 +69,7 @@ class BlobSighting:
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: angle of the left edge from the optical axis, positive to the left
-    right_rad: float  #: angle of the right edge, with the same sign: less than `left_rad`
+    right_rad: float  #: angle of the right edge with the same sign convention, smaller than `left_rad`
 
     @property
     def bearing_rad(self) -> float:
@@ -193,7 +193,7 @@ class GateDetector:
         ]
 
     def _sighting(self, edge: Array, intrinsics: Intrinsics) -> GateSighting | None:
-        """Return the opening that a hole's edge bounds; None if the hole is not an opening."""
+        """Return the opening bounded by a hole's edge; None if the hole is not an opening."""
         rough = self._four_corners(edge)
         if rough is None:
             return None

@@ -18,7 +18,7 @@ from skyloop.messages import Intrinsics
 from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
-_WIDEST = 1e-9  # z divided by distance: at smaller values a point is beside or behind the camera
+_WIDEST = 1e-9  # z divided by distance: a point with a smaller value is not in front of the camera
 _STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little besides its edges
 _DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which the distortion is sampled
 _RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it back
@@ -60,7 +60,7 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
         intrinsics: Intrinsics of the camera.
 
     Returns:
-            Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole camera or beyond
+            Pixels (n, 2); NaN for points that the model can't show: not in front of a pinhole camera or beyond
             the angle at which the lens polynomial turns back.
 
     Raises:
@@ -175,7 +175,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
     else:
         flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
     found = np.asarray(flat, dtype=np.float64).reshape(-1, 2)
-    # Beyond a lens's fold the iteration can end anywhere, so reject results that don't project back.
+    # Beyond a lens's fold the iteration may converge to any point, so reject results that don't project back.
     back = project(np.column_stack([found, np.ones(len(found))]), intrinsics)
     found[~(np.abs(back - pixels).max(axis=1) < _RETURN_PX)] = np.nan
     return found

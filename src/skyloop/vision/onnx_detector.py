@@ -50,7 +50,7 @@ RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
 #: Layouts whose boxes overlap and need suppression.
 SUPPRESSED: Final = frozenset({Layout.YOLO5, Layout.YOLO8, Layout.YOLOX, Layout.YOLOX_DECODED})
 
-_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # grids of YOLOX models [px]
+_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # strides of the grids of YOLOX models [px]
 _FEW: Final = 1000  # maximum number of queries of a network without suppression (usual: 100 to 900, mostly 300)
 
 Array = NDArray[np.generic]
@@ -79,7 +79,7 @@ def describe(outputs: Outputs) -> str:
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
     """Recognise a network's layout from its outputs by name, from one run on any image; width and height of its input.
 
-    FileFormatError if they fit none of the families, or more than one.
+    FileFormatError if they fit none of the families, or more than one. ``classes`` is the number of known class names.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -433,7 +433,7 @@ class OnnxDetector:
         tensor = np.ascontiguousarray(values[None], self._type)
         feed: dict[str, Any] = {self._input: tensor}
         for other in self._session.get_inputs():
-            if other.name != self._input:  # RT-DETR with its postprocessor takes the image size for its boxes
+            if other.name != self._input:  # RT-DETR's postprocessor needs the image size to scale its boxes
                 feed[other.name] = np.array([self.size], np.int64)
         try:
             results = self._session.run(None, feed)

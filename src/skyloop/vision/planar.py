@@ -90,8 +90,8 @@ class PlanarPose:
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
         """Estimate the pose from the four corners; None if no pose in front of the camera fits them.
 
-        The outline is in the object's own axes, (4, 3); rays are x/z and y/z of each corner; the method is an IPPE of
-        OpenCV.
+        ``outline_m`` uses the object's own axes, (4, 3); ``rays`` are x/z and y/z of each corner; ``method`` is one of
+        OpenCV's IPPE variants.
         """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
@@ -123,7 +123,7 @@ _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerSighting(PlanarSighting):
-    """One marker in one image. Its top left is the printed marker's own."""
+    """One marker in one image. Its top-left corner matches that of the printed marker."""
 
     id: int
 

@@ -53,7 +53,7 @@ class TrackResult:
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
     score: float  #: similarity to the target, 0 to 1; a score, not a probability
-    confidence: float | None = None  #: chance that the overlap is at least half; None without an estimate
+    confidence: float | None = None  #: probability that the overlap is at least half; None without an estimate
 
     @property
     def lost(self) -> bool:
@@ -243,7 +243,7 @@ _WINDOW: Final = (11, 11)  # window of Lucas-Kanade [px]
 _LEVELS: Final = 3  # number of levels of its image pyramid
 _AROUND: Final = (9, 9)  # size of a point's surroundings to compare [px]
 _ENOUGH: Final = 6  # minimum number of points
-_RETURN_PX: Final = 5.0  # maximum median return distance; a larger one is a failure
+_RETURN_PX: Final = 5.0  # maximum median distance after tracking back; tracking fails above it
 _SPREAD_PX: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
 _SMALLEST_PX: Final = 6.0  # minimum side of the box; a smaller one is a failure
 
@@ -258,7 +258,7 @@ class _Filter:
         self._below: Floats | None = None
 
     def learn(self, spectrum: Spectrum) -> None:
-        """Learn from a patch's spectrum (channels first): the first one fully, later ones by the learning rate."""
+        """Learn from a patch's spectrum (channels first): the first replaces the filter, later ones are blended in."""
         above = np.conj(self._wanted) * spectrum
         below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
         if self._above is None or self._below is None:

@@ -131,7 +131,8 @@ class Compiler:
     """Compiles the kernels once for this process, on a separate thread.
 
     When the process ends, it waits only for the function being compiled at that moment, not for all of them, because
-    LLVM must not be torn down while it works.
+    LLVM must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
+    ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:

@@ -1,12 +1,12 @@
-"""The planar renderer's work as loops over quads and pixels that Numba can compile (``compiled``).
+"""The planar renderer's loops over quads and pixels, in a form that Numba can compile (``compiled``).
 
 The loops compute the same as ``shading``, operation by operation in the same order and precision, so
 the image is identical bit by bit; that module explains the mathematics. They also run uncompiled, slowly, for tests
 without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
 hold the interpreter lock.
 
-Inner loops are short, write one array each and stay in single precision, because others would not become vector
-instructions. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
+Inner loops are short, write one array each and stay in single precision, because otherwise they would not be
+vectorised. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def prepare(
     pixel_area: float,  # 1/(fx fy) of the image
     # output: edge planes of each selected quad, as slopes along the grid's x and y and an offset, (n, 4, 3)
     edges: Floats,
-    planes: Floats,  # output: each selected quad's 1/z on the grid as slope along x, slope along y and start, (n, 3)
+    planes: Floats,  # output: each selected quad's 1/z on the grid, as slopes along x and y and an offset, (n, 3)
     # output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4)
     box: NDArray[np.int64],
     table: Singles,  # output: see ``sampling_table``, (13, n + 1)
@@ -169,7 +169,7 @@ def draw(
     # the image's memory, read as one number per pixel except the last, at intervals of three bytes
     packed: NDArray[np.int32],
 ) -> None:
-    """Draw an image like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+    """Draw the same image as ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
     For each band of the grid, find the nearest quad at each sample. Then colour the image rows that need no further
     bands, while this band is still in the cache.
@@ -246,8 +246,8 @@ def draw(
                 for n in range(columns):
                     line[n] = shown[n]
             known = bottom
-            # A few rows at a time: first the bits that differ within a column, including the row below, then the bits
-            # that differ from the next column.
+            # Process a few rows at a time: first set the bits for differences within a column, including the row below,
+            # then those for differences from the next column.
             last = bottom if bottom == grid_rows or samples == 1 else bottom - 1
             while compared < last:
                 end = min(compared + FEW, last)
@@ -413,7 +413,7 @@ def draw(
                     rim = rim if off < thickness * depth[n] + more else zero
                     shade[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))
                 for n in range(len(out)):
-                    # Divide by 255, rounded to nearest, with shifts.
+                    # Divide by 255 with shifts, rounding to nearest.
                     dark = np.int32(np.int32(shade[n] * np.int32(out[n] & 0xFF00FF)) + 0x800080)
                     green = np.int32(np.int32(shade[n] * np.int32(np.int32(out[n] >> 8) & 0xFF)) + 0x80)
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)

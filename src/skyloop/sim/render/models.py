@@ -73,7 +73,7 @@ class Figure:
     """A figure's parts: the rigid body, and limbs that swing about their upper ends."""
 
     body: Quads
-    #: equally large groups of quads, one per joint, each with its joint as origin; None without limbs
+    #: one group of quads per joint, all of the same size and with the joint as their origin; None if there are no limbs
     limbs: Quads | None
     joints: Floats  #: positions of the joints, (limbs, 3)
     swings: Floats  #: forward swing of each limb in the middle of a step [rad], (limbs,)
@@ -337,7 +337,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def target(atlas: AtlasBuilder, target: Target) -> Quads:
-    """Return a target's shape without its stand. A figure is at rest."""
+    """Return a target's shape without its stand. Figures are at rest."""
     if isinstance(target, BoardTarget):
         return board(atlas, target)
     if isinstance(target, FigureTarget):

@@ -28,7 +28,7 @@ from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
-#: Number of images that a renderer draws before; for fewer, compilation would take longer than it saves.
+#: Number of images that a renderer draws before it compiles; for fewer, compilation takes longer than it saves.
 WORTH_COMPILING: Final = 30
 
 
@@ -44,7 +44,7 @@ def use_one_core() -> None:
     """Restrict OpenCV to the calling thread in this whole process.
 
     Images this small don't benefit from more threads, and OpenCV's workers would occupy cores that proxies and
-    applications need. A process that only simulates calls this once at its start.
+    applications need. A process that only runs a simulation calls this once when it starts.
     """
     cv2.setNumThreads(1)
 
@@ -144,12 +144,12 @@ def _doubled(model: CameraModel) -> CameraModel:
     return model.scaled(2.0)
 
 
-_NOISE_MARGIN = 61  # rows and columns of noise beyond the image's size, so that each frame uses another part
+_NOISE_MARGIN = 61  # extra rows and columns of noise around the image, so that each frame can use a different part
 _BLUR_FROM_PX = 0.8  # minimum length of visible blur
 
 
 class SensorEffects:
-    """The flaws of a camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
+    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use from one thread at a time.
 
     The flaws of frame ``number`` depend only on the seed and the number, not on earlier frames.
     """
@@ -166,10 +166,10 @@ class SensorEffects:
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Apply the flaws to a BGR image of the camera's size, in place, and return it.
+        """Apply the imperfections to a BGR image of the camera's size, in place, and return it.
 
         The drone's angular velocity about its body axes (x forward, y left, z up), (3,), blurs the image over the
-        exposure; None for a drone that does not turn. ``number`` is the frame's.
+        exposure; None if the drone does not turn. ``number`` is the frame number.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
@@ -189,7 +189,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # The scene moves against the turn: about y (down) to the left, about x (right) down; roll is ignored.
+        # The scene moves against the rotation: to the left if about y (down), down if about x (right). Roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:

@@ -125,7 +125,7 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # number of corners, which are a quad's first vectors; then come the normal and the slopes of u and v
+_CORNERS = 4  # number of corners, a quad's first vectors, which its normal and the slopes of u and v follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class Quads:
     """
 
     vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)
-    starts: Floats  #: starts of u and v, (n, 2) [texel]
+    starts: Floats  #: offsets of u and v, (n, 2) [texel]
     texture: NDArray[np.intp]  #: number in the atlas, (n,)
     two_sided: NDArray[np.bool_]  #: whether it is visible from behind as well, (n,)
     priority: NDArray[np.intp]  #: priority, (n,); the highest one in a plane is visible
@@ -229,7 +229,7 @@ class QuadBuilder:
         """Add a rectangle as seen from the front: its lower left corner and its edges to the right and upwards [m].
 
         Of the quads in a plane, the one with the highest priority is visible; a ``lit`` one is brighter when facing the
-        light.
+        light. ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -273,8 +273,8 @@ class QuadBuilder:
     ) -> None:
         """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 
-        A pair of ``sides`` is for those facing along x and along y. ``ends`` are top and bottom; None for the texture
-        along x.
+        A pair of ``sides`` has the textures of the faces across x and across y; ``ends`` is for top and bottom, by
+        default the texture along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

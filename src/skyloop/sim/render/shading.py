@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skyloop.sim.camera import CameraPose
 from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
 
-# How much closer a picture counts than the wall behind it, per step of priority, as a fraction of the distance.
+# Fraction of its distance by which a picture counts as closer than the wall behind it, per step of priority.
 PRIORITY_SHARE = 1e-3
 # Maximum distance of the eye from the plane of a quad that is edge-on and covers nothing visible [m].
 EDGE_ON_M = 1e-5
@@ -41,7 +41,7 @@ class Grid:
 class View:
     """The quads that may be visible from a pose, and their position on the grid. All arrays have m as their first axis.
 
-    ``index``: numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
+    ``index``: indices in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
     ``height_m``: signed height of the eye above the plane, (m,). ``first``, ``end``: columns covered in each row,
     (m, height). ``box``: bounds x0, y0, x1, y1, (m, 4).
     """
@@ -55,7 +55,7 @@ class View:
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return a · b along the last axis of three, summed in order: independent of libraries, so always the same bits."""
+    """Return a · b along the last axis of three, summed in fixed order, so the bits don't depend on libraries."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 

@@ -1,7 +1,7 @@
 """Procedurally drawn surfaces for worlds: every name in :data:`skyloop.sim.world.TEXTURES`.
 
-Materials (parquet, brick …) keep their scale at any size of the surface; objects (crate, door, window, posters) fill it
-once. All are reproducible: the same size and seed give the same pixels.
+Materials (parquet, brick …) have the same scale on surfaces of any size; objects (crate, door, window, posters) fill
+the surface once. All are reproducible: the same size and seed give the same pixels.
 """
 
 from __future__ import annotations
