@@ -1,4 +1,4 @@
-"""A processor's class, loaded from a module or file, and the worker that gives it its share of a drone's frames."""
+"""A processor's class, loaded from a module or file, and the worker that runs it on its share of a drone's frames."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class Settings:
 
     name: str  #: name of the processor and of its results
     code: str  #: identifier of the code, the same for all workers
-    camera: str | None = None  #: name of the camera; None for the vehicle's first one
+    camera: str | None = None  #: name of the camera; None for the vehicle's first camera
     shared: bool = True  #: whether each frame goes to only one worker, instead of to all
     max_age_s: float | None = 1.0  #: maximum age of a frame when its turn comes; None for no limit
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit

@@ -32,10 +32,10 @@ class Settings:
     """
 
     drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace
-    #: request the authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
+    #: request control authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
     #: service. None: only the service requests it, with the default priority.
     priority: int | None = None
-    #: the drone hovers if ``cmd_vel`` is silent for this long; must be greater than 0 and at most 5 s
+    #: the drone hovers if no cmd_vel arrives for this long; must be greater than 0 and at most 5 s
     timeout_s: float = 0.5
     #: a common frame for all drones' ``odom``, if a single simulator or motion capture system locates them; empty: none
     map_frame: str = ""
@@ -49,7 +49,7 @@ class Settings:
         if not self.drones:
             raise UsageError("a bridge to ROS 2 needs at least one drone")
         if not 0.0 < self.timeout_s <= 5.0:
-            raise UsageError(f"the time-out of cmd_vel is {self.timeout_s!r} must be greater than 0 and at most 5 s")
+            raise UsageError(f"the time-out of cmd_vel is {self.timeout_s!r} and must be greater than 0, at most 5 s")
         if self.priority is not None and not 0 <= self.priority <= 31:
             raise UsageError(f"priority is {self.priority!r} and must be from 0, the highest, to 31")
         namespaces_of(self.drones)

@@ -1,4 +1,4 @@
-"""Flying a drone through ROS topics and services, which requires control authority, and access to its parameters."""
+"""Control of a drone through ROS topics and services, which requires authority, and access to its parameters."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Pilot:
         drone: The drone, connected as a pilot, with the time after which a velocity becomes a hover.
         time: Provides the stamps.
         frames: Names of the drone's frames.
-        priority: Priority for requesting the authority, 0 (highest) to 31; None: the default.
+        priority: Priority for requesting authority, 0 (highest) to 31; None uses the default.
         timeout_s: Maximum age of a stamped velocity [s].
     """
 
@@ -77,7 +77,7 @@ class Pilot:
         services.create_service(GetPlan, "go_to", self._go_to, callback_group=group)
 
     def request_authority(self) -> None:
-        """Request the authority with the configured priority.
+        """Request control authority with the configured priority.
 
         Raise ``AuthorityError`` if another application, named in the error, holds the authority.
         """
@@ -233,7 +233,7 @@ class Parameters:
         drone.on_event(self._on_event)
 
     def _set(self, parameters: list[Any]) -> Any:
-        """Write the values that differ. Stop at the first refusal, with the proxy's reason."""
+        """Write the values that differ. Stop at the first refusal and return the proxy's reason."""
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:

@@ -298,7 +298,7 @@ class CameraPublisher:
         message.height, message.width = frame.shape[:2]
         message.encoding = "bgr8"
         message.step = 3 * message.width
-        pixels = array("B")  # rclpy accepts this type directly; it would convert bytes one at a time
+        pixels = array("B")  # rclpy accepts this type directly but converts bytes one at a time
         pixels.frombytes(frame.data.cast("B"))
         message.data = pixels
         return message

@@ -1,4 +1,4 @@
-"""Cameras of simulated drones: lens and mounting, rate, latency and flaws of the sensor.
+"""Cameras of simulated drones: lens and mounting, rate, latency and sensor imperfections.
 
 Pixels follow OpenCV: x right, y down, with the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
 forward. Body axes: x forward, y left, z up. A rotation "body from optical" converts optical vectors to body vectors.

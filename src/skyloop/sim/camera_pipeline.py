@@ -20,8 +20,8 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Factor by which more frames are rendered than used if fewer are used than the camera takes, so that a consumer that
-#: selects frames by its own count always finds one in time.
+#: Ratio of rendered to used frames if fewer are used than the camera takes: a consumer that selects frames by its own
+#: count then always finds one in time.
 RATE_MARGIN: Final = 1.25
 
 
@@ -65,7 +65,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether to render the exposure that is due, if so many frames per second are wanted (may be inf)."""
+        """Return whether to render the exposure that is due, given the frames per second that are wanted (0 to inf)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -132,7 +132,7 @@ class Pipeline(ABC):
 class CameraPipeline(Pipeline):
     """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
-    Creating the scene takes some tenths of a second, so start the pipeline when the first frame is requested.
+    Creating the scene takes a few tenths of a second, so start the pipeline when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -227,7 +227,7 @@ def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
 def expose(
     camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
-    """Return an exposure of a state by a camera. The frame is due after the camera's latency."""
+    """Return the exposure of a camera to a state. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone
     pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
     due_ns = captured_ns + nanoseconds(model.latency_s / speed)

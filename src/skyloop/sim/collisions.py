@@ -1,7 +1,7 @@
 """Collisions of drones with the floor, solids and each other: contact, bounce and friction.
 
 Every few steps, a broad phase finds everything within each drone's reach until the next broad phase. The steps in
-between then check only those pairs, as arrays if there are many and one at a time if there are few.
+between check only those pairs, as arrays if there are many and one at a time if there are few.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce, or nothing would come to rest
+_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce; otherwise nothing would come to rest
 _PASSES = 6  # number of attempts per step to push a drone out of solids
 _TOUCH_M = 1e-9  # maximum overlap that counts as touching, because rounding leaves some that pushing can't remove
 #: Number of steps between broad phases. With few drones, each costs as much but leaves fewer pairs to check.
@@ -69,7 +69,7 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # for hull centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
@@ -297,7 +297,7 @@ class Collisions:
     # Drones ----------------------------------------------------------------------------------------------------
 
     def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
-        """Separate overlapping drones; return whether one may exceed the broad phase's reach in the remaining time."""
+        """Separate overlapping drones; return whether one might leave the broad phase's reach in the remaining time."""
         strayed = False
         for one, other in self._close_pairs():
             if self._separate(one, other, left_s, contacts):

@@ -369,7 +369,7 @@ class Bodies(BodyTable):
         np.add(self.position, total, out=self.position)
 
     def _lift(self) -> Floats:
-        """Return the lagged thrust, near the floor times 1 / (1 - (R / 4h)²): Cheeseman, Bennett 1955."""
+        """Return the lagged thrust, multiplied near the floor by 1 / (1 - (R / 4h)²) (Cheeseman, Bennett 1955)."""
         lift, shortfall = self._c, self._d
         np.subtract(self.thrust_command, self.thrust, out=lift)
         np.multiply(lift, self._motor_share, out=lift)

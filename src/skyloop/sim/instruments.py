@@ -82,7 +82,7 @@ class Firmware(Protocol):
         lock. It must return in bounded time and call no method of the simulation.
 
         Args:
-            readings: The readings at the beginning of the step.
+            readings: The readings at the start of the step.
 
         Returns:
             Rotor commands, 0 (stopped) to 1 (full): front left, front right, rear left, rear right. Values outside this
@@ -187,7 +187,7 @@ class Instruments:
         self._pressure_pa = 0.0
         self._below_m = math.inf
         self._range_m: float | None = None
-        self._turned = (0.0, 0.0, 0.0, 0.0)  # about forward and left since the last flow: true, gyro
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # rotation about forward and left: true, then gyro
         self._first = -1
 
     def read(

@@ -70,7 +70,7 @@ class Pacer:
     """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
     Small delays are caught up. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in ``lost_s``, and
-    the deadlines move. Not thread-safe: one thread owns the pacer::
+    the deadlines are postponed. Not thread-safe: one thread owns the pacer::
 
         while not stop.wait(pacer.run_due()):
             publish()

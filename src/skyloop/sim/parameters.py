@@ -82,8 +82,8 @@ class RotorParameters:
     full_speed_rad_s: float  #: speed at full command
     speed_up_s: float  #: time constant of an accelerating rotor
     speed_down_s: float  #: time constant of a decelerating rotor
-    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. Its
-    #: causes are blade flapping and the blades' asymmetric drag.
+    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. It is
+    #: caused by blade flapping and the blades' asymmetric drag.
     rotor_drag_kg: float
     rotor_inflow_kg: float  #: the same along the rotors' axes, where air from above reduces the thrust
     body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
@@ -183,7 +183,7 @@ class VehicleParameters:
     battery_full_v: float = 12.5
     battery_empty_v: float = 9.6
     battery_resistance_ohm: float = 0.08  # estimate
-    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the electronics
+    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the power of the electronics
     electronics_power_w: float = 5.0  # estimate
 
     # Sensors: standard deviations of the noise, and of biases that wander with the time constant. Estimates for
@@ -228,8 +228,8 @@ class VehicleParameters:
             raise UsageError("battery_empty_v must be below battery_full_v")
         if self.rotors is not None and not self.most_thrust < self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):
             raise UsageError(
-                f"most_thrust {self.most_thrust:g} of the weight must be below what the rotors give, "
-                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: the attitude needs the rest"
+                f"most_thrust {self.most_thrust:g} of the weight must be below the rotors' maximum, "
+                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: attitude control needs the rest"
             )
 
 

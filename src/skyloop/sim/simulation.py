@@ -240,7 +240,7 @@ class Simulation:
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
         """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
-        The position is that of its centre in world axes. A drone that is not flying raises UsageError.
+        The position describes its centre, in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):

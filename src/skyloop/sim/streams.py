@@ -30,7 +30,7 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
-    """Return the random stream for a purpose and an index (of a drone, target, camera or step). This takes some 15 µs.
+    """Return the random stream for a purpose and an index (of a drone, target, camera or step). This takes about 15 µs.
 
     The same arguments give the same stream in all versions.
     """

@@ -36,7 +36,7 @@ from skyloop.sim.world import (
 )
 
 GRID_S = 0.02  # spacing of the points, between which motion is linear
-KEPT_S = 60.0  # duration of the past that is available for a target
+KEPT_S = 60.0  # length of the history that is available for a target
 
 _TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
 _RING_STEP_RAD = (math.radians(20), math.radians(45))

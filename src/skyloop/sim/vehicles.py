@@ -94,7 +94,7 @@ IRIS = VehicleParameters(
         rotor_drag_kg=8.06428e-5,  # [R]
         rotor_inflow_kg=8.06428e-5,  # estimate: same as the drag across
         body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1; estimate
-        efficiency=0.8,  # estimate for some 20 minutes in the air
+        efficiency=0.8,  # estimate for about 20 minutes in the air
     ),
 )
 

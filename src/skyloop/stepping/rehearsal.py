@@ -119,7 +119,7 @@ class _RehearsalDriver(SimDriver):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next step or arrival is due."""
+        """Time at which the next step or arrival is due."""
         assert isinstance(self.host, SteppedHost)
         step_ns = self.host.due_ns
         if step_ns is None or not self._on_the_way:
@@ -196,7 +196,7 @@ class SteppedHost(SimHost):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next step is due on the clock; None without an observer."""
+        """Time on the clock at which the next step is due; None if there is no observer."""
         return None if self._manual_stepper is None else self._manual_stepper.due_ns
 
     def step(self) -> None:

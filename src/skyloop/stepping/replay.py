@@ -27,8 +27,8 @@ def connector(uri: str) -> SteppedReplay | None:
     Args:
         uri: The address, ``replay://…``.
 
-    Returns:
-        The replay if the address says ``speed=max``; otherwise None, because a private proxy serves such addresses.
+    Returns: The replay if the address contains ``speed=max``; otherwise None, because a private proxy serves such
+        addresses.
 
     Raises:
         UsageError: The address or the recording is invalid.

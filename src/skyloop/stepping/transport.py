@@ -125,7 +125,7 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect a client, whose handler runs on the executor's thread; LinkError for a second or after a stop."""
+        """Connect a client, whose handler runs on the executor's thread; LinkError if there is one or after a stop."""
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")
@@ -272,7 +272,7 @@ class StepSource(Protocol):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next event is due; None after the last one."""
+        """Time at which the next event is due; None after the last one."""
 
     def step(self) -> None:
         """Publish the sample or run the step that is due now."""

@@ -36,7 +36,7 @@ _LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
 _SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
 _ABOVE_PX: Final = 6  # height of the area above a pole that is searched for something hiding its top
 _COLOURFUL: Final = 100  # saturation from which a pixel counts as colourful, 0 to 255
-_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece; overlapping poles have less
+_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece; overlapping poles have fewer
 
 
 class ColourMask:

@@ -31,7 +31,7 @@ def checked(
     """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
 
     It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
-    wrong shape or type, an empty array, or without intrinsics.
+    wrong shape or type, an empty array, or missing intrinsics.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)

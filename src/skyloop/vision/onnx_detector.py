@@ -77,7 +77,7 @@ def describe(outputs: Outputs) -> str:
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Recognise a network's layout from its outputs by name, from one run on any image; width and height of its input.
+    """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
 
     FileFormatError if they fit none of the families, or more than one. ``classes`` is the number of known class names.
     """
@@ -327,7 +327,7 @@ class OnnxDetector:
         layout: Layout of the network's outputs.
         names: Class names by number.
         size: Width and height of the network's input [px].
-        dropped: Number of detections dropped for values that were not finite or a score outside 0 to 1.
+        dropped: Number of detections dropped because a value was not finite or the score was not from 0 to 1.
     """
 
     def __init__(
@@ -473,7 +473,7 @@ class OnnxDetector:
         extra = [each.name for each in inputs[1:] if each.name != "orig_target_sizes"]
         shown = ", ".join(f"{each.name} {each.type} {tuple(each.shape)}" for each in inputs) or "none"
         if not inputs or extra:
-            raise FileFormatError(f"{self._path} has the inputs {shown} and must have one, an image")
+            raise FileFormatError(f"{self._path} has the inputs {shown} and must have exactly one, an image")
         first = inputs[0]
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
@@ -481,7 +481,7 @@ class OnnxDetector:
                 f"{self._path} has the input {shown} and must have (1, 3, height, width) of float, float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
-            raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for one")
+            raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for batches of 1")
         fixed = [each if isinstance(each, int) and each > 0 else None for each in (shape[3], shape[2])]
         if size is None:
             asked = _literal(metadata.get("imgsz"))

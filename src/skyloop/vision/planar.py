@@ -117,7 +117,7 @@ _FAMILIES: Final = (
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between attempts (some 2 ms each at 320×240), which end once a marker is found
+_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), which end once a marker is found
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
@@ -204,7 +204,7 @@ class MarkerDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
-        """Search for markers of another family, a different one each time."""
+        """Search for markers of another family, choosing a different family each time."""
         known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]

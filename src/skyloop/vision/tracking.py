@@ -245,7 +245,7 @@ _AROUND: Final = (9, 9)  # size of a point's surroundings to compare [px]
 _ENOUGH: Final = 6  # minimum number of points
 _RETURN_PX: Final = 5.0  # maximum median distance after tracking back; tracking fails above it
 _SPREAD_PX: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
-_SMALLEST_PX: Final = 6.0  # minimum side of the box; a smaller one is a failure
+_SMALLEST_PX: Final = 6.0  # minimum side of the box, below which tracking fails
 
 
 class _Filter:
@@ -501,7 +501,7 @@ def _stretch(before: Floats, after: Floats) -> float:
 class LearnedTracker(Tracker):
     """Tracks by a neural network that OpenCV runs on the CPU. The score is the one returned by the network.
 
-    Skyloop doesn't include the weights: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, NanoTrack's
+    Skyloop doesn't include the weights: the OpenCV Zoo offers object_tracking_vittrack_2023sep.onnx, and NanoTrack's
     repository has its two files.
     """
 
@@ -511,7 +511,7 @@ class LearnedTracker(Tracker):
         Args:
             weights: ONNX file of ViTTrack or, together with ``head``, of NanoTrack's backbone.
             head: ONNX file of NanoTrack's neck and head.
-            lost_below: Score below which the target is lost.
+            lost_below: Score below which the target counts as lost.
 
         Raises:
             MissingExtraError: OpenCV is not installed.

@@ -1,7 +1,7 @@
 """Drawing with the ``kernels``, compiled by Numba if it is installed: the same images, several times faster.
 
 Importing Numba takes almost a second, and the first compilation takes longer; from then on the machine code is in
-Numba's cache on disk. No image waits for either: both happen on a separate thread.
+Numba's cache on disk. No image has to wait for either: both happen on a separate thread.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels. See :class:`Painter`."""
+    """Draws with the functions of ``kernels``. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)

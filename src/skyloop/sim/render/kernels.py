@@ -92,7 +92,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # with a margin of two samples for rounding, because the edges decide
+        if ahead:  # with a margin of two samples for rounding, because the edge planes decide
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx
@@ -159,7 +159,7 @@ def draw(
     pairs: NDArray[np.int64],  # each texel of the atlas and the one after it, BGRA each, packed into one number
     atlas_size: tuple[int, int],  # number of rows and columns of the atlas
     gap: float,  # gap between two levels of a texture in the atlas [texels]
-    farthest: float,  # 1/z to assume for a ray beyond a quad's horizon [1/m]
+    farthest: float,  # 1/z assumed for a ray that points beyond a quad's horizon [1/m]
     # box of each shadow: first row, row after the last, first column, column after the last, (s, 4)
     boxes: NDArray[np.int64],
     axes: Singles,  # rotation from optical to world axes

@@ -30,7 +30,7 @@ class Raster:
     #: Flat index on the grid of each pixel's first sample, (pixels,). The other three are to its right, below it, and
     #: below and to its right.
     lookup: NDArray[np.int32]
-    #: Scales in x and y, then offsets in x and y. A ray (x, y, 1) from ``rays``, times the scale plus the start, gives
+    #: Scales in x and y, then offsets in x and y. Scaling a ray (x, y, 1) from ``rays`` and adding the offsets gives
     #: the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
     to_grid: NDArray[np.float32]
     sample_x: NDArray[np.float32]  #: x/z of each column of the grid

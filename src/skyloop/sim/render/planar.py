@@ -151,7 +151,7 @@ _BLUR_FROM_PX = 0.8  # minimum length of visible blur
 class SensorEffects:
     """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use from one thread at a time.
 
-    The flaws of frame ``number`` depend only on the seed and the number, not on earlier frames.
+    The imperfections of frame ``number`` depend only on the seed and the number, not on earlier frames.
     """
 
     def __init__(self, model: CameraModel, seed: int = 0) -> None:

@@ -61,7 +61,7 @@ class Atlas:
 
     image: NDArray[np.uint8]  #: the image, BGRA (OpenCV samples four channels twice as fast as three)
     x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
-    y0: NDArray[np.float64]  #: row where each texture's level 0 starts, in the same form
+    y0: NDArray[np.float64]  #: row where each texture's level 0 starts; same type and shape
     span: NDArray[np.float64]  #: twice the padded width of each texture
 
 
@@ -125,7 +125,7 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # number of corners, a quad's first vectors, which its normal and the slopes of u and v follow
+_CORNERS = 4  # number of corners, a quad's first vectors; the normal and the slopes of u and v follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,7 @@ class Quads:
 
     @property
     def v_start(self) -> Floats:
-        """Start of v [texel], (n,)."""
+        """Value of v at the origin [texel], (n,)."""
         return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
@@ -248,7 +248,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a quad (4, 3) cut from the textured rectangle that is given by the corner and the two edges."""
+        """Add a quad (4, 3) cut from the textured rectangle defined by the corner and the two edges."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))

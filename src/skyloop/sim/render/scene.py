@@ -32,7 +32,7 @@ class Posed:
 class Scene:
     """The renderable parts of a world with a number of drones.
 
-    Building it draws all textures (some tenths of a second). It never changes afterwards, so renderers on several
+    Building it draws all textures (a few tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
     """
 

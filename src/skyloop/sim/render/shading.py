@@ -336,7 +336,7 @@ class Extremes:
 
     @staticmethod
     def along(values: NDArray[np.float32], axis: int) -> Extremes:
-        """Compute the extremes; axis 0 is for those of columns."""
+        """Compute the extremes; axis 0 gives those of the columns."""
         least, most = values.min(axis=axis), values.max(axis=axis)
         return Extremes(least, most, float(least.min()), float(most.max()))
 
