@@ -68,7 +68,7 @@ class Bridge:
         self._settings = settings
         self._stack = ExitStack()
         self._cameras: list[CameraPublisher] = []
-        self.drones: dict[str, Drone] = {}  #: keyed by name
+        self.drones: dict[str, Drone] = {}  #: connected drones by name
         self.namespaces = namespaces_of(settings.drones)  #: namespaces by drone name, without a slash
 
     def __enter__(self) -> Self:

@@ -42,7 +42,7 @@ class Happening(Enum):
     HOVER = auto()
     SET_POINT = auto()
     STOP = auto()
-    RESET = auto()  # only on the ground; the caller checks this
+    RESET = auto()  # allowed only on the ground, which the caller checks
     HEIGHT_REACHED = auto()
     TOUCHED_GROUND = auto()
     CRASHED = auto()
@@ -86,7 +86,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """Return the next state, or None if the event is ignored."""
+    """Return the next state, or None if the happening is ignored."""
     return TRANSITIONS[state].get(happening)
 
 

@@ -241,8 +241,8 @@ BOTTOM_CAMERA = CameraModel(
     exposure_s=0.006,
     vignetting=0.15,
 )
-# A racing pilot's view: 100° by 76° and 120° across the corners, like a wide 2.1 mm lens, tilted as for fast
-# flight. A racing pilot's view: 100° by 76° (120° diagonally), like that of a wide 2.1 mm lens, tilted for fast flight.
+# A racing pilot's view: 100° by 76° (120° diagonally), like that of a wide 2.1 mm lens, tilted for fast flight. Rate,
+# latency and short exposure are estimates for an analogue camera.
 FPV_CAMERA = CameraModel(
     name="fpv",
     width=320,

@@ -328,7 +328,7 @@ class Collisions:
         upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
         depth = -max(across, upright)
         if depth <= 0.0:
-            return False  # pushed apart by a third drone
+            return False  # a third drone pushed them apart
         if across > upright:
             nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
         else:

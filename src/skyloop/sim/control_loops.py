@@ -60,7 +60,7 @@ class Sensors:
         self.velocity: Floats = self._estimate[1:]  #: velocity forward, left, up in levelled axes, (3, n) [m/s]
         self._few = few(n)
         if self._few:
-            self.numbers = Fields(self._estimate, 0, 4)  #: for a few drones: altitude and velocity
+            self.numbers = Fields(self._estimate, 0, 4)  #: altitude and velocity, for a few drones
             self._each = list(enumerate(self._half_height.tolist()))
         self.estimate()
 

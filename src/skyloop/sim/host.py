@@ -1,4 +1,4 @@
-"""A world with drones, advanced in real time and rendered for the drones' observers (drivers and emulators)."""
+"""A world with drones that keeps its own time and is rendered for the drones' observers (drivers and emulators)."""
 
 from __future__ import annotations
 

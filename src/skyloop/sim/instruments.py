@@ -182,7 +182,7 @@ class Instruments:
             )
         )
         self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
-        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step in which it arrives
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # fixes, each with the step in which it arrives
         self._magnetic: Vec3 = (0.0, 0.0, 0.0)
         self._pressure_pa = 0.0
         self._below_m = math.inf

@@ -1,4 +1,4 @@
-"""True image boxes of objects in a simulated camera's view and of their visible parts, for training and tests.
+"""True image boxes of objects in a camera's view, with visible fractions, for training, tests and benchmarks.
 
 They are drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the
 pixels that each would cover if nothing occluded it.

@@ -144,7 +144,7 @@ class VehicleParameters:
     """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
-    mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
+    mass_kg: float = 0.42  # includes the indoor hull [P]; used only when drones collide; everything else is per mass
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
     linear_drag_per_s: float = 0.45  # with the next value, gives 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
@@ -160,11 +160,11 @@ class VehicleParameters:
     rotor_height_m: float = 0.05  # height of the rotors above the feet, for the ground effect; estimate
     ground_effect: float = 1.0  # fraction of the effect of one rotor with this radius [C]; 0 switches it off
     motor_time_constant_s: float = 0.06  # estimate
-    most_thrust: float = 1.9  # as a multiple of the weight, with a full battery; estimate
-    least_thrust: float = 0.3  # as a fraction of the weight, while the motors are running; estimate
+    most_thrust: float = 1.9  # maximum thrust as a multiple of the weight, with a full battery; estimate
+    least_thrust: float = 0.3  # minimum thrust as a fraction of the weight while the motors run; estimate
 
     # Inner loops
-    attitude_frequency_rad_s: float = 16.0  # together with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
+    attitude_frequency_rad_s: float = 16.0  # gives, with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s

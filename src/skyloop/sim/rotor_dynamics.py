@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant for slower rotors, which the mixer commands beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -110,7 +110,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
     rows = [[1.0] * 4, ys, [-x for x in xs], [rotors.torque_m * sign for sign in YAW_SIGNS]]
     _, roll, pitch, yaw = (np.linalg.inv(np.array(rows)) * (1.0, ix, iy, iz)).T.tolist()
-    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # of the rotors
+    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # values for each rotor
     return Constants(
         thrust=k,
         idle_speed=rotors.idle_speed_rad_s,

@@ -240,7 +240,7 @@ class Simulation:
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
         """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
-        The position describes its centre, in world axes. A drone that is not flying raises UsageError.
+        ``position_m`` is where its centre goes, in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -313,7 +313,7 @@ class Simulation:
     def motions(self) -> tuple[Floats, Floats, Floats]:
         """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
-        Positions are true ones in world axes, shape (n, 3) [m]; velocities forward, left and up are the drones'
+        Positions are true values in world axes, shape (n, 3) [m]; velocities forward, left and up are the drones'
         estimates, up to 12 ms older, shape (n, 3) [m/s]; roll, pitch and yaw (within ±π) are true, shape (n, 3) [rad].
         """
         with self._lock:

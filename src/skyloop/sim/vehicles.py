@@ -67,7 +67,7 @@ RACER = VehicleParameters(
 
 #: A 3DR Iris, with a maximum thrust of 1.6 times its weight.
 IRIS = VehicleParameters(
-    mass_kg=1.52,  # including the rotors [R]
+    mass_kg=1.52,  # includes the rotors [R]
     radius_m=0.36,  # distance to the rotors [R] plus a rotor's radius
     half_height_m=0.055,  # 110 mm high [R]
     rotor_radius_m=0.1,  # [R]

@@ -67,7 +67,7 @@ def confidence(score: float) -> float:
 
 class _State(Enum):
     TRACKING = "tracking"
-    ON_TRIAL = "on trial"  # found again, not yet trusted
+    ON_TRIAL = "on trial"  # target found again but not yet trusted
     LOST = "lost"
 
 

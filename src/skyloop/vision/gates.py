@@ -310,7 +310,7 @@ class PoleDetector:
         for label, (x, y, width, height, area) in enumerate(boxes[:count].tolist()):
             if label == 0 or height < _LEAST_HEIGHT_PX or area * _SLIM > height * height:
                 continue
-            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # cut off at the side or the top
+            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # the pole is cut off at the side or the top
                 continue
             line = _line(labels[y : y + height, x : x + width] == label)
             if line is None:

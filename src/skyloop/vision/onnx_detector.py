@@ -36,10 +36,10 @@ class Layout(StrEnum):
     YOLO8 = "yolo8"  #: (1, 4 + classes, n), pixels: YOLOv8, v9, v11
     END_TO_END = "end-to-end"  #: (1, n, 6) left, top, right, bottom, score, class: YOLOv10, exports with suppression
     YOLOX = "yolox"  #: (1, n, 5 + classes), offsets on a grid; the input is BGR of 0 to 255
-    YOLOX_DECODED = "yolox-decoded"  #: as YOLOX, but in pixels
+    YOLOX_DECODED = "yolox-decoded"  #: like YOLOX, but in pixels
     RT_DETR = "rt-detr"  #: (1, n, 4 + classes), fractions of the image
     DETR = "detr"  #: boxes (1, n, 4), fractions of the image, and logits or scores (1, n, classes)
-    RF_DETR = "rf-detr"  #: as DETR, but the input is normalised by ImageNet's mean and deviation
+    RF_DETR = "rf-detr"  #: like DETR, but the input is normalised by ImageNet's mean and deviation
     LISTS = "lists"  #: boxes (n, 4) in pixels, scores (n) and labels (n): torchvision, RT-DETR with its postprocessor
 
 

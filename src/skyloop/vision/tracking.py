@@ -1,7 +1,7 @@
 """Trackers that follow a box from image to image by a correlation filter, by the flow of points, or by a network.
 
-The tracker learns a filter whose correlation with the patch around the target has a narrow peak at the middle of the
-patch. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
+**Correlation.** The tracker learns a filter whose correlation with the patch around the target peaks sharply in its
+middle. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
 correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
 (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
 linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan, Häger, Khan
@@ -95,7 +95,7 @@ class Tracker(ABC):
         """
         pixels = pixels_of(image)
         checked = checked_box(box, pixels.shape)
-        self._shape = None  # in case _start fails
+        self._shape = None  # remains None if _start fails
         self._start(pixels, checked)
         self._shape = pixels.shape
 
@@ -229,7 +229,7 @@ _AREA_PX: Final = 128.0**2  # area of the sampled patch around the target
 _CONTEXT: Final = 1.5  # margin added to width and height, as a multiple of the square root of the target's area
 _RATE: Final = 0.02  # learning rate per image
 _SCALE_RATE: Final = 0.02  # learning rate of the size filter per image
-_REGULARISATION: Final = 0.02  # as a fraction of the spectrum's mean energy
+_REGULARISATION: Final = 0.02  # regularisation as a fraction of the spectrum's mean energy
 _SPREAD: Final = 0.08  # width of the peak as a fraction of the target's size
 _SCALES: Final = 17  # number of sizes tried per image
 _SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes

@@ -92,7 +92,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # with a margin of two samples for rounding, because the edge planes decide
+        if ahead:  # add a margin of two samples for rounding, because the edge planes decide
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx

@@ -349,7 +349,7 @@ def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
     """Return a marker's card in front of a wooden board on a pole; origin is the card's centre, x its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # from face axes (right, up, normal) to (x ahead, y left, z up)
+    # rotates face axes (right, up, normal) to (x ahead, y left, z up)
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     half = target.pattern.card_size_m / 2 + 0.02
     wood = atlas.add(("board", round(half, 3)), lambda: draw_surface("wood", 2 * half, 2 * half, min(256, 96 / half)))
@@ -380,7 +380,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     body.box((-narrow, -narrow, -2 * z - _POLE_M), (narrow, narrow, -2 * z), paint(atlas, _DARK))
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # from face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
+    # rotates face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 

@@ -73,7 +73,7 @@ class PlanarRenderer:
         self.quality = quality
         self._compiler = compiler
         self._pictures = 0
-        self._painters: dict[tuple[object, ...], Painter] = {}  # by lens
+        self._painters: dict[tuple[object, ...], Painter] = {}  # painters by lens
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:

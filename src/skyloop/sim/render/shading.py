@@ -135,7 +135,7 @@ class DepthBuffer:
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
-        """``priority`` has one value per quad in the view, (m,)."""
+        """Update :attr:`seen`. ``priority`` has one value per quad in the view, (m,)."""
         grid = self._grid
         slope = view.inverse_depth * (1.0 + PRIORITY_SHARE * priority)[:, None] / (grid.fx, grid.fy, 1.0)
         start = slope[:, 2] - slope[:, 0] * grid.cx - slope[:, 1] * grid.cy
