@@ -157,7 +157,7 @@ class ControlLoops:
         self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
         self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
         self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
-        # The last row is how far a landing drone is above its expected descent.
+        # The last row is the height of a landing drone above its expected descent.
         self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
         self._rows = tuple(table)
         self._by_velocity[:] = 1.0
@@ -268,7 +268,7 @@ class ControlLoops:
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Compute roll and pitch from the velocity error; the integral is in world axes, where yawing leaves wind as is.
+        # Compute roll and pitch from the velocity error. The integral uses world axes, where yaw doesn't affect the wind.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S

@@ -69,8 +69,8 @@ SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
 class Pacer:
     """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are caught up. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in ``lost_s``, and
-    the deadlines are postponed. Not thread-safe: one thread owns the pacer::
+    The pacer catches up on small delays. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in
+    ``lost_s``, and the deadlines are postponed. Not thread-safe: one thread owns the pacer::
 
         while not stop.wait(pacer.run_due()):
             publish()

@@ -207,7 +207,7 @@ class VehicleParameters:
     restitution: float = 0.35  # fraction of the normal speed after a bounce; estimate
     friction: float = 0.5  # Coulomb friction; estimate
 
-    #: Rotors of a vehicle that is modelled down to them (``docs/rotors.md``); None models its response as a whole. If
+    #: Rotors of a vehicle modelled at rotor level (``docs/rotors.md``); None models its response as a whole. If
     #: there are rotors, their own values replace the drag, motor time constant and hover power above.
     rotors: RotorParameters | None = None
 

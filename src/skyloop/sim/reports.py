@@ -18,7 +18,7 @@ class VehicleFeedback:
 
     time_s: float  #: simulation time
     state: FlightState
-    emergency_reason: str  #: why the motors were cut; empty in other states
+    emergency_reason: str  #: reason why the motors were cut; empty in other states
     battery: float  #: remaining charge, 0 to 1
     battery_v: float
     roll_rad: float

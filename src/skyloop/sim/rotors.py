@@ -1,6 +1,6 @@
-"""Bodies modelled down to their four rotors in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
+"""Bodies modelled at rotor level in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
 
-As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays and a few one by one, with the same bits.
+As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays, a few one by one, with bit-identical results.
 """
 
 from __future__ import annotations

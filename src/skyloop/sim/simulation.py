@@ -357,7 +357,7 @@ def _one_each(given: T | Sequence[T], drones: int, what: str) -> list[T]:
 
 
 def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
-    """Return whether the vehicles are modelled down to their rotors."""
+    """Return whether the vehicles are modelled at rotor level."""
     have = {vehicle.rotors is not None for vehicle in parameters}
     if len(have) > 1:
         raise UsageError("vehicles with and without rotors (VehicleParameters.rotors) need separate simulations")

@@ -1,4 +1,4 @@
-"""Vehicles with a response identified from recorded flights, and vehicles modelled down to their rotors.
+"""Vehicles whose response was identified from recorded flights, and vehicles modelled at rotor level.
 
 Parameters not given here have their defaults. ``docs/rotors.md`` has a table of those for the rotor-level vehicles.
 

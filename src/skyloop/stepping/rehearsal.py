@@ -71,7 +71,7 @@ class Radio:
 def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
     """Connect as a pilot to a drone in a simulated world.
 
-    Only the thread that runs the ``with`` block may wait. Frames are rendered at their exposure, not in real time.
+    Only the thread that runs the ``with`` block may wait. Frames are rendered when they are exposed, not in real time.
 
     Args:
         uri: A ``sim://`` address without ``speed``.

@@ -190,7 +190,7 @@ class SteppedServer(TransportServer):
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection, only once; each end's handler is called after all earlier packets have been delivered."""
+        """End a connection unless it has ended; each side's handler is called after all earlier packets."""
         if self._client is not client:
             return
         self._client = None
@@ -257,7 +257,7 @@ class SteppedClient(TransportClient):
             self._handler.frame(header, pixels)
 
     def ended(self, reason: str) -> None:
-        """Notify the handler, only once, that the connection has ended."""
+        """Notify the handler, once, that the connection has ended."""
         self._handler.closed(reason)
         self._closed.set()
 

@@ -336,7 +336,7 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # Without k3: estimated from few images it is mostly noise, and it bends the image's corners, where there was no
+    # k3 is left out: estimated from few images, it is mostly noise and bends the image's corners, where there was no
     # data. Lenses that need k3 are fisheye lenses.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria

@@ -189,7 +189,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # The scene moves against the rotation: to the left if about y (down), down if about x (right). Roll is ignored.
+        # The scene moves to the left if the camera rotates about y (down), down if about x (right). Roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
@@ -197,7 +197,7 @@ class SensorEffects:
         steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
         right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
         across, along = abs(right).max(), abs(down).max()
-        # As small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
+        # Keep this as small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
         kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
         np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)

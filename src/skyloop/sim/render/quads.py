@@ -273,8 +273,8 @@ class QuadBuilder:
     ) -> None:
         """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 
-        A pair of ``sides`` has the textures of the faces across x and across y; ``ends`` is for top and bottom, by
-        default the texture along x.
+        A pair of ``sides`` holds the textures of the faces that face along x and along y; ``ends`` is for top and
+        bottom, by default the texture along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

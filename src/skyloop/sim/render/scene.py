@@ -30,7 +30,7 @@ class Posed:
 
 
 class Scene:
-    """The renderable parts of a world with a number of drones.
+    """The renderable parts of a world and its drones.
 
     Building it draws all textures (a few tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
