@@ -272,7 +272,7 @@ class View:
             from skyloop.sim.render import PlanarRenderer, Scene, SceneState
         except ImportError:
             raise MissingExtraError("drawing the simulator's world", "sim") from None
-        self.arena = arena  #: replaceable by any arena with as many drones: their worlds are equal
+        self.arena = arena  #: replaceable by any arena with as many drones: their worlds are identical
         self._model = CameraModel("view", width, height, 25.0, focal_px, focal_px, width / 2, height / 2)
         self._pose: Any = CameraPose
         self._state = SceneState

@@ -73,7 +73,7 @@ class BlobSighting:
 
     @property
     def bearing_rad(self) -> float:
-        """Angle of the object's middle from the optical axis, positive to the left."""
+        """Angle of the object's centre from the optical axis, positive to the left."""
         return (self.left_rad + self.right_rad) / 2
 
     @property

@@ -149,7 +149,7 @@ def draw(
     ray_x: Singles,  # x of each pixel's ray (x, y, 1), (height, width)
     ray_y: Singles,  # y of each pixel's ray, (height, width)
     sample_x: Singles,  # x of the ray through each column of the grid
-    sample_y: Singles,  # y of the ray of each row of the grid
+    sample_y: Singles,  # y of the ray through each row of the grid
     nearest: Singles,  # work array: 1/z at each sample of a band, (BAND, columns)
     numbers: NDArray[np.int32],  # work array, (BAND, columns)
     # Work array: each sample's column in the table, or 0 for none; the sign bit is set if the sample may differ from

@@ -20,7 +20,7 @@ from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
 
 # Fraction of its distance by which a picture counts as closer than the wall behind it, per step of priority.
 PRIORITY_SHARE = 1e-3
-# Maximum distance of the eye from the plane of a quad that is edge-on and covers nothing visible [m].
+# Maximum distance between the eye and a quad's plane for the quad to count as edge-on and invisible [m].
 EDGE_ON_M = 1e-5
 _BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
 
