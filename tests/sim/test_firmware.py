@@ -177,7 +177,7 @@ def test_drones_that_firmware_cannot_fly_are_refused_with_the_reason() -> None:
     with pytest.raises(UsageError, match="RACER, IRIS and CRAZYFLIE"):
         Simulation(HALL).fly_by(0, Scripted(idle))
     simulation = flying(parameters=ideal(IRIS))
-    with pytest.raises(UsageError, match=r"in the air \(hovering\): firmware takes over on the ground"):
+    with pytest.raises(UsageError, match=r"in the air \(hovering\): firmware can take over only on the ground"):
         simulation.fly_by(0, Scripted(idle))
     with pytest.raises(UsageError, match="no firmware flies drone 0"):
         simulation.release(0)

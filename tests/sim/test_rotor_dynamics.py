@@ -317,7 +317,7 @@ def test_invalid_instruments_are_refused() -> None:
 
 
 def test_thrust_must_leave_a_reserve_for_the_attitude() -> None:
-    with pytest.raises(UsageError, match="most_thrust 5 of the weight must be below what the rotors give"):
+    with pytest.raises(UsageError, match="most_thrust 5 of the weight must be below the rotors' maximum"):
         replace(RACER, most_thrust=5.0)
     with pytest.raises(UsageError, match="no rotors"):
         constants_of(VehicleParameters())

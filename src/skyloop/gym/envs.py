@@ -42,7 +42,7 @@ SIZE: Final = (320, 240)
 ONBOARD_PX: Final = 64  #: default edge length of the onboard camera's images
 _FOCAL_PX: Final = 260.0  #: focal length of the rendering camera
 _ONBOARD_FOCAL: Final = 40.0 / 64.0  # focal length divided by the edge length: 77° field of view
-_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera, relative to the middle of the first cell's floor [m]
+_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera's offset from the centre of the first cell's floor [m]
 _AT: Final = np.array([0.0, 0.0, 1.8])  #: point at which the rendering camera looks, in the same axes [m]
 _EYE_M: Final = np.array([0.12, 0.0, 0.0])  # onboard camera, just in front of the drone's body
 _AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # rotates optical axes into body axes
@@ -102,8 +102,8 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
     position of the goal (forward, left, up) [m]; the drone's own velocity estimate [m/s]; roll (positive right side
     down) and pitch (positive nose down) [rad]; sine and cosine of the turn to the desired heading. With ``"pixels"``:
     the front camera's image, RGB, shape (size_px, size_px, 3), uint8, showing the goal as a red ring. With ``"both"``:
-    a dict of ``pixels`` and ``motion`` (velocity, roll and pitch). ``info`` has ``is_success`` and ``distance_m``, also
-    after a reset. Leaving the 7 m cell costs 5 and ends the episode. ``vehicle`` is one of
+    a dict of ``pixels`` and ``motion`` (velocity, roll and pitch). ``info`` contains ``is_success`` and ``distance_m``,
+    including after a reset. Leaving the 7 m cell costs 5 and ends the episode. ``vehicle`` is one of
     ``skyloop.sim.vehicles.VEHICLES``. ``render_mode="rgb_array"`` renders an image of the drone and its goal.
     """
 
@@ -154,7 +154,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
 
 
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
-    """Many drones in one simulation, which is many times faster than a simulation for each.
+    """Many drones in one simulation, which is many times faster than one simulation per drone.
 
     Like :class:`TaskEnv`, with a leading axis; a finished episode starts over in the next step
     (``AutoresetMode.NEXT_STEP``).
@@ -201,7 +201,7 @@ class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
         if again.any():
             self._task.restart(again, self.np_random)
         rewards, ended, over, infos = self._task.step(np.asarray(actions, dtype=float))
-        # The first step of a new episode is its reset, which earns no reward and cannot end the episode.
+        # The first step of a new episode only resets it: it earns no reward and cannot end the episode.
         rewards[again], ended[again], over[again] = 0.0, False, False
         over &= ~ended
         self._ended = ended | over
@@ -213,7 +213,7 @@ def _one(infos: Infos) -> dict[str, Any]:
 
 
 class ReachEnv(TaskEnv):
-    """Fly to a position and stay there. Up to 0.1 per step at the goal, less with distance and for jerky actions."""
+    """Fly to a position and stay there. The reward is up to 0.1 per step, reduced by distance and jerky actions."""
 
     task = Reaching
 
@@ -231,7 +231,7 @@ class FollowEnv(TaskEnv):
 
 
 class GatesEnv(TaskEnv):
-    """Fly through four gates in order. Rewards are 1 per gate and per metre closer to the next; the last ends it."""
+    """Fly through four gates in order. Rewards are 1 per gate and 1 per metre towards the next; the last ends it."""
 
     task = Racing
 
@@ -272,7 +272,7 @@ class View:
             from skyloop.sim.render import PlanarRenderer, Scene, SceneState
         except ImportError:
             raise MissingExtraError("drawing the simulator's world", "sim") from None
-        self.arena = arena  #: may be replaced by another one with as many drones, because their worlds are the same
+        self.arena = arena  #: replaceable by any arena with as many drones: their worlds are identical
         self._model = CameraModel("view", width, height, 25.0, focal_px, focal_px, width / 2, height / 2)
         self._pose: Any = CameraPose
         self._state = SceneState

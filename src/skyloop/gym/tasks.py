@@ -14,7 +14,7 @@ from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
 from skyloop.sim.vehicles import VEHICLES
 
-CELL_M: Final = 8.0  #: edge length of each drone's own square
+CELL_M: Final = 8.0  #: side length of the square reserved for each drone
 REACH_M: Final = 3.5  #: a drone further than this from its cell's centre has left it
 LOWEST_M: Final = 0.3
 HIGHEST_M: Final = 4.5
@@ -111,19 +111,19 @@ PERIOD_S: Final = 0.04  #: time between two actions
 SPEED_M_S: Final = 1.0  #: velocity commanded by an action of 1
 TURN_RAD_S: Final = 1.5  #: turn rate commanded by an action of 1
 NEAR_M: Final = 0.2  #: a goal closer than this counts as reached
-FOLLOWED_M: Final = 1.5  #: the desired distance from a followed target
+FOLLOWED_M: Final = 1.5  #: desired distance from a followed target
 GATES: Final = 4
 GATE_RADIUS_M: Final = 0.5
 _GATE_RING_M: Final = 1.8  #: radius of the circle on which the gates are placed
-_FOLLOWING_M: Final = 0.3  #: greatest error in distance with which a target counts as followed
-_FOLLOWING_RAD: Final = 0.35  #: greatest bearing of the target with which it counts as followed
+_FOLLOWING_M: Final = 0.3  #: maximum distance error at which a target counts as followed
+_FOLLOWING_RAD: Final = 0.35  #: maximum bearing of the target at which it counts as followed
 _SPREAD: Final = (2.0, 2.0, 0.8)  #: greatest distance of goals and starts from the middle of a cell, per axis [m]
 _HEIGHT: Final = 2.0  #: height of the middle of a cell [m]
 _WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from the middle of its cell, per axis [m]
 _WALK_RAD_S: Final = 0.18  #: angular rate of the walk, which limits its speed to 0.3 m/s
 _FAILURE: Final = -5.0  #: reward for leaving the cell or crashing
 _FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
-#: Bounds of: goal forward, left, up [m]; velocity forward, left, up [m/s]; roll, pitch [rad]; sine, cosine of the turn
+#: Bounds for the goal forward, left, up [m]; velocity forward, left, up [m/s]; roll, pitch [rad]; turn's sine, cosine
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
 MOTION: Final = slice(3, 8)  #: the part of an observation that holds the drone's own motion: velocity, roll, pitch
 
@@ -172,7 +172,7 @@ class Reaching:
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
         """Choose a new start and a new goal for these drones."""
-        self.age[which] = 0  # must precede placing: moving goals depend on the age
+        self.age[which] = 0  # must precede the call of ``_place``, because moving goals depend on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)
@@ -192,7 +192,7 @@ class Reaching:
         return rewards - 0.002 * jerk + _FAILURE * failed, failed | done, self.age >= self.steps, infos
 
     def infos(self) -> Infos:
-        """Return the further values for each drone, as :meth:`step` does."""
+        """Return the additional information on each drone, as :meth:`step` does."""
         places, _, angles = self.arena.state()
         return self._judge(places, angles[:, 2])[2]
 
@@ -226,7 +226,7 @@ class Reaching:
         self.goals[drone], self.headings[drone] = goal, rng.uniform(-math.pi, math.pi)
         return start, heading
 
-    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others need it
+    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others use it
         """Return the rewards, which tasks are completed, and further values."""
         distances = np.linalg.norm(self.goals - places, axis=1)
         rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
@@ -256,7 +256,7 @@ class Following(Reaching):
         self._rates = np.zeros((drones, 3))
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Move the targets, then do the base class's step."""
+        """Move the targets, then perform the base class's step."""
         self._walk(self.age + 1)
         return super().step(actions)
 
@@ -265,7 +265,7 @@ class Following(Reaching):
         self._rates[drone] = rng.uniform(0.5, 1.0, 3) * _WALK_RAD_S * rng.choice([-1.0, 1.0], 3)
         self._walk(self.age)
         target = self.goals[drone]
-        bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # towards the middle
+        bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # roughly to the middle
         away = float(rng.uniform(1.2, 2.2))
         start = target + np.array([away * math.cos(bearing), away * math.sin(bearing), 0.0])
         return start, bearing + math.pi + float(rng.uniform(-0.3, 0.3))
@@ -318,14 +318,14 @@ class Racing(Reaching):
         return start, float(self.headings[drone])
 
     def _aim(self) -> None:
-        """Set each drone's goal to the middle of its next gate, facing the direction of passage."""
+        """Set each drone's goal to the centre of its next gate, with the heading for flying through it."""
         rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
         self.goals = self._gates[rows, following]
         normals = self._normals[rows, following]
         self.headings = np.arctan2(normals[:, 1], normals[:, 0])
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Do the base class's step, rewarding each gate with 1 and the approach to the next one."""
+        """Perform the base class's step, adding 1 for each gate and the distance gained towards the next one."""
         before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
         rewards, done, over, infos = super().step(actions)
         nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)
@@ -336,7 +336,7 @@ class Racing(Reaching):
         super().restart(which, rng)
         self._places[which] = self.arena.state()[0][which]
 
-    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  as the others
+    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  same signature
         rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
         normals = self._normals[rows, following]
         was, now = self._places - self.goals, places - self.goals

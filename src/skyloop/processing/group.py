@@ -60,7 +60,7 @@ class Group:
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
-        """Start so many children; ``tell`` gets a text on a child's thread when that child dies."""
+        """Start ``count`` children; ``tell`` is called on a child's thread with a text when that child dies."""
         self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
 
     @property

@@ -1,4 +1,4 @@
-"""A processor's class, loaded from a module or file, and the worker that gives it its share of a drone's frames."""
+"""A processor's class, loaded from a module or file, and the worker that runs it on its share of a drone's frames."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _DIGITS: Final = 16  #: number of digits of the code's hash
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A processor's class, and a mark that distinguishes it from other code with the same name."""
+    """A processor's class, with an identifier that distinguishes it from other code of the same name."""
 
     kind: type[Any]
     mark: str  #: name of the class and a hash of the file that defines it
@@ -112,7 +112,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """Return the class with that name or, without a name, the only class with a method ``process``."""
+    """Return the class of that name or, without a name, the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -154,7 +154,7 @@ def _source(kind: type[Any]) -> bytes:
 
 _LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
-_KEPT: Final = 1024  #: number of newest results and frames kept for rates and ages
+_KEPT: Final = 1024  #: number of most recent results and frames kept to compute rates and ages
 #: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
@@ -185,11 +185,11 @@ class Settings:
 
     name: str  #: name of the processor and of its results
     code: str  #: identifier of the code, the same for all workers
-    camera: str | None = None  #: name of the camera; None for the vehicle's first one
+    camera: str | None = None  #: name of the camera; None for the vehicle's first camera
     shared: bool = True  #: whether each frame goes to only one worker, instead of to all
-    max_age_s: float | None = 1.0  #: skip frames older than this when their turn comes; None skips none
+    max_age_s: float | None = 1.0  #: maximum age of a frame when its turn comes; None for no limit
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
-    stuck_s: float = 2.0  #: duration of a ``process`` call after which the other workers get this one's share
+    stuck_s: float = 2.0  #: duration of a ``process`` call after which this worker's frames go to the others
 
     def __post_init__(self) -> None:
         checked_name(self.name)
@@ -238,13 +238,13 @@ class Worker:
         self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)
 
     def run(self, seconds: float | None = None) -> None:
-        """Process frames until :meth:`stop` is called or the drone closes, then leave the processor's workers.
+        """Process frames until :meth:`stop` is called or the drone closes, then unregister as a worker.
 
         Args:
             seconds: Maximum duration [s]; None for no limit.
 
         Raises:
-            NameTakenError: Different code has taken the name since, which is possible while the proxy is away.
+            NameTakenError: Different code took the name in the meantime, which can happen while the proxy is away.
             RefusedError: The proxy refuses this worker for a different reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
@@ -254,7 +254,7 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # returns its memory to the proxy while waiting for the next
+                    del arrival  # frees its memory for the proxy while waiting for the next
         finally:
             self.membership.close()
 
@@ -292,11 +292,11 @@ class Worker:
             stuck = not self._ready()
             self._busy_since_s = None
             if stuck:
-                self.membership.renew()  # asks the proxy for a share again
+                self.membership.renew()  # asks the proxy for a new share
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Return whether the worker can take frames, which it can't while a call of ``process`` exceeds ``stuck_s``."""
+        """Return whether the worker can take frames, which it can't once a ``process`` call exceeds ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -340,7 +340,7 @@ class Worker:
 class Frames:
     """The newest unprocessed frame in a worker's share. A context manager that is subscribed while open.
 
-    It requests only the share's frames and follows changes of the share, so that no other frames travel over a network.
+    It requests only the frames in that share, even when the share changes, so no other frames travel over a network.
     """
 
     def __init__(
@@ -371,11 +371,11 @@ class Frames:
 
     @property
     def dropped(self) -> int:
-        """Number of the share's frames that were replaced by newer ones."""
+        """Number of frames in the share that were replaced by newer ones."""
         return self._buffer.dropped
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """Take the newest frame; None if none arrives within ``timeout_s`` [s]."""
+        """Return the newest frame, or None if none arrives within ``timeout_s`` [s]."""
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
@@ -415,9 +415,9 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     processor: str
     camera: str
     processes: int = 1  #: number of workers that these statistics cover
-    part: int = 0  #: index of the worker's part of the frames; 0 for several workers
-    parts: int = 0  #: number of parts, 0 if there is none now; for several workers, how many have a part
-    workers: int = 0  #: number of workers of this processor and camera that the proxy knows
+    part: int = 0  #: index of this worker's part of the frames; 0 in statistics of several workers
+    parts: int = 0  #: number of parts, 0 if there is none now; in statistics of several workers, how many have a part
+    workers: int = 0  #: number of workers of this processor and camera that are known to the proxy
     frames: int = 0  #: number of frames in the worker's part
     results: int = 0
     dropped: int = 0  #: number of frames replaced by newer ones before the worker was ready
@@ -475,7 +475,7 @@ def together(found: Iterable[Status]) -> Status | None:
 
 
 class Tally:
-    """Counters of a worker. One thread counts frames, another one results; any thread can read them."""
+    """Counters of a worker. One thread counts frames and another counts results; any thread can read the counters."""
 
     def __init__(self, clock: Clock) -> None:
         self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0
@@ -484,7 +484,7 @@ class Tally:
         self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # time, age [s], duration [s]
 
     def came(self) -> None:
-        """Count a frame in the worker's part. Called on the receiving thread."""
+        """Count a frame assigned to this worker. Called on the receiving thread."""
         self.frames += 1
         self._came.append(self._clock())
 

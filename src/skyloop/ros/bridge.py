@@ -32,10 +32,10 @@ class Settings:
     """
 
     drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace
-    #: request the authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
+    #: request control authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
     #: service. None: only the service requests it, with the default priority.
     priority: int | None = None
-    #: the drone hovers if ``cmd_vel`` is silent for this long; must be greater than 0 and at most 5 s
+    #: the drone hovers if no cmd_vel arrives for this long; must be greater than 0 and at most 5 s
     timeout_s: float = 0.5
     #: a common frame for all drones' ``odom``, if a single simulator or motion capture system locates them; empty: none
     map_frame: str = ""
@@ -49,7 +49,7 @@ class Settings:
         if not self.drones:
             raise UsageError("a bridge to ROS 2 needs at least one drone")
         if not 0.0 < self.timeout_s <= 5.0:
-            raise UsageError(f"the time-out of cmd_vel is {self.timeout_s!r} and must be above 0 and up to 5 s")
+            raise UsageError(f"the time-out of cmd_vel is {self.timeout_s!r} and must be greater than 0, at most 5 s")
         if self.priority is not None and not 0 <= self.priority <= 31:
             raise UsageError(f"priority is {self.priority!r} and must be from 0, the highest, to 31")
         namespaces_of(self.drones)
@@ -68,7 +68,7 @@ class Bridge:
         self._settings = settings
         self._stack = ExitStack()
         self._cameras: list[CameraPublisher] = []
-        self.drones: dict[str, Drone] = {}  #: keyed by name
+        self.drones: dict[str, Drone] = {}  #: connected drones by name
         self.namespaces = namespaces_of(settings.drones)  #: namespaces by drone name, without a slash
 
     def __enter__(self) -> Self:
@@ -106,9 +106,9 @@ class Bridge:
                 return
 
     def _add(self, context: RosContext, drone: Drone, namespace: str) -> tuple[Any, Any]:
-        """Set up a drone; return the node whose callbacks may wait, and the one whose callbacks never do."""
+        """Set up a drone; return two nodes: one whose callbacks may block and one whose callbacks never do."""
         settings = self._settings
-        # No node may publish the type that transforms borrow under another name (skyloop.ros.names).
+        # Nodes must not publish the type that the transforms borrow and rename (skyloop.ros.names).
         own = {"use_sim_time": settings.use_sim_time, "start_type_description_service": False}
         node = context.node("skyloop", namespace, own)
         topics = context.node("skyloop_commands", namespace, own)
@@ -125,7 +125,7 @@ class Bridge:
 
 
 def _connect(name: str, timeout_s: float) -> Drone:
-    """Connect as a pilot, without requesting the authority yet."""
+    """Connect as a pilot, without requesting control authority yet."""
     return open_unasked(Drone, dial_by_name(name), app="skyloop ros", timeout_s=NAME_TIMEOUT_S, stall_s=timeout_s)
 
 

@@ -1,10 +1,10 @@
-"""What ROS 2 requires: names of a drone's namespace and frames (REP 105), its time, and its type for transforms.
+"""Names, times and types as ROS 2 requires them: a drone's namespace and frames (REP 105), time, and transforms' type.
 
 rclpy lacks ``tf2_msgs/msg/TFMessage`` if that message's package is not installed, so the publisher sends ready-made
 bytes. rclpy gets a *type support* from a message's class: a C structure with the message's name, the hash of its
 definition, and functions that serialise it (``rosidl_message_type_support_t`` and, for Fast DDS,
-``message_type_support_callbacks_t``). A publisher of bytes calls only the one that returns the largest size, which
-unbounded members make unknown. The functions of another such message therefore work, under this one's name and hash.
+``message_type_support_callbacks_t``). A publisher of bytes calls only the one that returns the largest size, which is
+unknown with unbounded members. The functions of another such message therefore work with this one's name and hash.
 """
 
 from __future__ import annotations

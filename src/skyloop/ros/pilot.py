@@ -1,4 +1,4 @@
-"""Control of a drone through ROS: flying by topics and services, with the authority to do so, and its parameters."""
+"""Control of a drone through ROS topics and services, which requires authority, and access to its parameters."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
-NEAR_M: Final = 0.2  #: tolerance for a goal that has none of its own
+NEAR_M: Final = 0.2  #: tolerance for a goal that does not specify one
 WARN_AGAIN_S: Final = 5.0  #: interval between warnings of the same kind
 
 
 class Pilot:
-    """Converts messages on topics and service calls to commands. Commands need the authority.
+    """Converts messages on topics and service calls to commands. Commands require control authority.
 
     Args:
         topics: The rclpy node whose callbacks never wait, in the drone's namespace.
@@ -27,7 +27,7 @@ class Pilot:
         drone: The drone, connected as a pilot, with the time after which a velocity becomes a hover.
         time: Provides the stamps.
         frames: Names of the drone's frames.
-        priority: Priority for requesting the authority, 0 (highest) to 31; None: the default.
+        priority: Priority for requesting authority, 0 (highest) to 31; None uses the default.
         timeout_s: Maximum age of a stamped velocity [s].
     """
 
@@ -56,7 +56,7 @@ class Pilot:
         self._log = topics.get_logger()
         self._lock = threading.Lock()
         self._under_way: list[str] = []  # services that are waiting for the drone
-        # Keep only the newest sample, from both reliable and best-effort publishers.
+        # Accept reliable and best-effort publishers alike, and keep only the newest sample.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
@@ -77,7 +77,7 @@ class Pilot:
         services.create_service(GetPlan, "go_to", self._go_to, callback_group=group)
 
     def request_authority(self) -> None:
-        """Request the authority with the configured priority.
+        """Request control authority with the configured priority.
 
         Raise ``AuthorityError`` if another application, named in the error, holds the authority.
         """
@@ -212,15 +212,15 @@ class Pilot:
 
 
 def _in_words_of_ros(error: SkyloopError) -> str:
-    """Return the reason, naming the equivalent services in place of Python calls."""
+    """Return the reason, with the equivalent services instead of Python calls."""
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
 class Parameters:
-    """Declares the drone's parameters on a node, writes values set through ROS, and shows changes made elsewhere.
+    """Declares the drone's parameters on a node, writes values set through ROS, and mirrors changes made elsewhere.
 
     ``node``: the rclpy node. Setting a parameter waits for the drone's proxy. ``drone``: the drone, connected as a
-    pilot, because writing needs the authority.
+    pilot, because writing requires control authority.
     """
 
     def __init__(self, node: Any, drone: Drone) -> None:
@@ -233,7 +233,7 @@ class Parameters:
         drone.on_event(self._on_event)
 
     def _set(self, parameters: list[Any]) -> Any:
-        """Write the values that differ. The first refusal stops this, with the proxy's reason."""
+        """Write the values that differ. Stop at the first refusal and return the proxy's reason."""
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
@@ -248,7 +248,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
     def _on_event(self, event: Event) -> None:
-        """Show a value that was written elsewhere. Runs on the drone's own thread."""
+        """Update a parameter whose value was changed elsewhere. Runs on the drone's own thread."""
         name = event.data.get("name")
         if event.kind is not EventKind.PARAMETER_CHANGED or name not in self._known:
             return

@@ -208,8 +208,8 @@ class Telemetry:
         if origin is None or feedback.position_m is None:
             return None
         latitude_deg, longitude_deg, _ = origin.place_of(feedback.position_m)
-        # The altitude in a NavSatFix is above the ellipsoid, the vehicle's is above sea level; the difference (up to
-        # 100 m) is not known here.
+        # NavSatFix requires the altitude above the ellipsoid, but the vehicle reports it above sea level; the
+        # difference (up to 100 m) is not known here.
         message = NavSatFix(latitude=latitude_deg, longitude=longitude_deg, altitude=math.nan)
         message.status.status = NavSatStatus.STATUS_FIX
         message.status.service = NavSatStatus.SERVICE_GPS
@@ -298,7 +298,7 @@ class CameraPublisher:
         message.height, message.width = frame.shape[:2]
         message.encoding = "bgr8"
         message.step = 3 * message.width
-        pixels = array("B")  # rclpy accepts this type directly; it would convert bytes one at a time
+        pixels = array("B")  # rclpy accepts this type directly but converts bytes one at a time
         pixels.frombytes(frame.data.cast("B"))
         message.data = pixels
         return message

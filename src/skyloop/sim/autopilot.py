@@ -1,7 +1,7 @@
 """The drones' flight logic, which applies commands, follows a table of states and controls the loops' set-points.
 
 A :class:`Happening` changes a state. If :data:`TRANSITIONS` does not list it for the current state, it is ignored, as
-in firmware. Some are caused by the charge of the :class:`Batteries`.
+in firmware. Some happenings depend on the charge of the :class:`Batteries`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Happening(Enum):
     HOVER = auto()
     SET_POINT = auto()
     STOP = auto()
-    RESET = auto()  # only on the ground; the caller checks this
+    RESET = auto()  # allowed only on the ground, which the caller checks
     HEIGHT_REACHED = auto()
     TOUCHED_GROUND = auto()
     CRASHED = auto()
@@ -74,7 +74,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
     _S.HOVERING: _IN_FLIGHT,
     _S.FLYING: _IN_FLIGHT,
     _S.LANDING: {
-        _H.HOVER: _S.HOVERING,  # aborts the landing, like real autopilots
+        _H.HOVER: _S.HOVERING,  # aborts the landing, as real autopilots do
         _H.TAKEOFF: _S.TAKING_OFF,
         _H.TOUCHED_GROUND: _S.LANDED,
         _H.STOP: _S.EMERGENCY,
@@ -86,7 +86,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """Return the next state; None if the happening is ignored."""
+    """Return the next state, or None if the happening is ignored."""
     return TRANSITIONS[state].get(happening)
 
 
@@ -120,7 +120,7 @@ class Batteries:
 
 LOW_BATTERY = 0.03  # charge below which the vehicle lands, 0 to 1
 _HEIGHT_TOLERANCE_M = 0.08  # distance below its target height at which a take-off counts as finished
-_STANDING_S = 0.05  # time since the last ground contact up to which a drone counts as standing
+_STANDING_S = 0.05  # maximum time since the last ground contact for a drone to count as standing
 _KEPT_OCCURRENCES = 1000
 
 
@@ -151,8 +151,8 @@ class Autopilot:
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point in force is only clamped when it is sent again. The loops' own tilt, climb and altitude change
-        immediately.
+        A set-point in force is only clamped when it is sent again. The limits on tilt, climb and altitude that the
+        control loops enforce change immediately.
         """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
@@ -181,7 +181,7 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Hover at a flying drone's new position without any estimate of the wind there."""
+        """Make a flying drone hover at its new position, with its estimate of the wind reset."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
@@ -232,7 +232,7 @@ class Autopilot:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
     def feel(self, contacts: Contacts, time_s: float) -> None:
-        """React to the contacts in a step."""
+        """Handle the contacts in a step."""
         for drone, speed, what in contacts.impacts:
             text = f"hit {what} at {speed:.1f} m/s"
             self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)
@@ -267,7 +267,7 @@ class Autopilot:
         return action
 
     def _enter(self, drone: int, state: FlightState, before: FlightState, action: AnyAction) -> None:
-        """Set up the loops for a state."""
+        """Set up the control loops for a flight state."""
         parameters, loops = self._parameters[drone], self._loops
         if state is not FlightState.TAKING_OFF and self._rising.pop(drone, None) is not None:
             loops.set_ceiling(drone, self.limits[drone].altitude_m)

@@ -1,4 +1,4 @@
-"""Cameras of simulated drones: lens and mounting, rate, latency and flaws of the sensor.
+"""Cameras of simulated drones: lens and mounting, rate, latency and sensor imperfections.
 
 Pixels follow OpenCV: x right, y down, with the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
 forward. Body axes: x forward, y left, z up. A rotation "body from optical" converts optical vectors to body vectors.
@@ -175,7 +175,7 @@ def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.f
 def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
     """Invert :func:`distort` by Newton's method; return None if there is no inverse near the optical axis."""
     straight = np.empty_like(points)
-    for first in range(0, len(points), _BLOCK):  # in blocks that keep intermediate values in the CPU cache
+    for first in range(0, len(points), _BLOCK):  # processed in blocks so that intermediate values stay in the CPU cache
         part = slice(first, first + _BLOCK)
         if (block := _undistort(points[part], distortion)) is None:
             return None
@@ -241,8 +241,8 @@ BOTTOM_CAMERA = CameraModel(
     exposure_s=0.006,
     vignetting=0.15,
 )
-# A racing pilot's view: 100° by 76° and 120° across the corners, like a wide 2.1 mm lens, tilted as for fast
-# flight. Rate, latency and short exposure are estimates for an analogue camera.
+# A racing pilot's view: 100° by 76° (120° diagonally), like that of a wide 2.1 mm lens, tilted for fast flight. Rate,
+# latency and short exposure are estimates for an analogue camera.
 FPV_CAMERA = CameraModel(
     name="fpv",
     width=320,

@@ -20,8 +20,8 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that selects
-#: frames by its own count always finds one in time.
+#: Ratio of rendered to used frames if fewer are used than the camera takes: a consumer that selects frames by its own
+#: count then always finds one in time.
 RATE_MARGIN: Final = 1.25
 
 
@@ -42,7 +42,7 @@ class Shutter:
         self.count = 0  #: number of exposures so far, including those without an observer
 
     def due(self, now_s: float, fps: float) -> bool:
-        """Return whether to expose now. Exposures missed during a pause are not made up for."""
+        """Return whether an exposure is due. Exposures missed during a pause are not made up for."""
         if now_s < self._next_s:
             return False
         self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
@@ -65,7 +65,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether the exposure due now is worth rendering for so many frames per second (or infinitely many)."""
+        """Return whether to render the exposure that is due, given the frames per second that are wanted (0 to inf)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -73,7 +73,7 @@ class Camera:
         return self._limiter.in_time(captured_ns)
 
     def finish(self, picture: NDArray[np.uint8], number: int, rates_rad_s: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Apply the sensor's flaws to an ideal image."""
+        """Apply the sensor's imperfections to an ideal image."""
         if self._effects is None or self._effects[0] is not self.model:
             self._effects = self.model, SensorEffects(self.model, self.seed)
         return self._effects[1].apply(picture, number, rates_rad_s)
@@ -118,7 +118,7 @@ class Pipeline(ABC):
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames from these cameras. After this returns, no other thread delivers one."""
+        """Stop delivering frames from these cameras. After this returns, no other thread delivers frames."""
         with self._handing:
             for camera in cameras:
                 camera.gone = True
@@ -132,7 +132,7 @@ class Pipeline(ABC):
 class CameraPipeline(Pipeline):
     """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
-    Creating the scene takes some tenths of a second, so start the pipeline when the first frame is requested.
+    Creating the scene takes a few tenths of a second, so start the pipeline when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -159,7 +159,7 @@ class CameraPipeline(Pipeline):
             self._thread.join()
 
     def expose(self, exposures: list[Exposure]) -> None:
-        """Queue exposures. Each replaces one of the same camera that is still waiting."""
+        """Queue exposures. A new exposure replaces a waiting one of the same camera."""
         with self._changed:
             for exposure in exposures:
                 if exposure.camera in self._waiting:
@@ -227,7 +227,7 @@ def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
 def expose(
     camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
-    """Expose a camera to a state. The frame is due after the camera's latency."""
+    """Return the exposure of a camera to a state. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone
     pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
     due_ns = captured_ns + nanoseconds(model.latency_s / speed)

@@ -1,7 +1,7 @@
 """Collisions of drones with the floor, solids and each other: contact, bounce and friction.
 
 Every few steps, a broad phase finds everything within each drone's reach until the next broad phase. The steps in
-between then check only those pairs, as arrays if there are many and one at a time if there are few.
+between check only those pairs, as arrays if there are many and one at a time if there are few.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce, or nothing would come to rest
+_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce; otherwise nothing would come to rest
 _PASSES = 6  # number of attempts per step to push a drone out of solids
-_TOUCH_M = 1e-9  # maximum overlap that counts as touching: rounding leaves some that no push removes
-#: Number of steps between broad phases. With few drones one costs as much but leaves fewer pairs to check.
+_TOUCH_M = 1e-9  # maximum overlap that counts as touching, because rounding leaves some that pushing can't remove
+#: Number of steps between broad phases. With few drones, each costs as much but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
 _SLACK_M = 0.03  # extra reach in a broad phase, to allow for drones being pushed
 #: Maximum number of pairs that are faster to check one at a time.
@@ -31,10 +31,10 @@ FEW_PAIRS = 6
 
 @dataclass(slots=True)
 class Contacts:
-    """The contacts in a step."""
+    """The contacts during one step."""
 
     standing: set[int] = field(default_factory=set)  #: drones supported from below by something other than a drone
-    #: pairs of a drone standing on another, the upper one first
+    #: pairs of drones in which one stands on the other, upper one first
     upon: list[tuple[int, int]] = field(default_factory=list)
     #: drone, speed along the normal [m/s], and the name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
@@ -44,13 +44,13 @@ class Contacts:
 class _Near:
     """Everything that is within the drones' reach until the next broad phase."""
 
-    one: Indices  #: the first drone of each pair of drones within reach; it has the lower number
+    one: Indices  #: index of the first drone in each pair of drones within reach, the lower of the two
     other: Indices  #: the second drone of each pair
     across: Floats  #: the square of the sum of the pair's radii
     upright: Floats  #: the square of the sum of the pair's half heights
     #: the solids within reach, by drone; drones that are only near a wall or the ceiling have none
     solids: dict[int, list[int]]
-    who: Indices  #: number of the drone in each pair of a drone and a solid
+    who: Indices  #: index of the drone in each pair of a drone and a solid
     what: Indices  #: number of the solid in each of these pairs
     sizes: Floats  #: sizes of the solids; see :meth:`Solids.sizes`
     moving: bool  #: whether one of these solids is moving
@@ -69,21 +69,21 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # for the centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
         self._feet = self._hull[2]
-        # Rows, because writing single numbers is faster than writing columns.
+        # Row views, because writing single numbers to rows is faster than to columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
-        self._free = bodies.position.copy()  # last position of each drone clear of all fixed objects
+        self._free = bodies.position.copy()  # last position at which each drone was clear of all fixed objects
         self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
         self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # step of the next broad phase
-        self._reach = np.zeros(len(parameters))  # how far each drone can move until then
+        self._reach = np.zeros(len(parameters))  # distance that each drone can move until then
         self._extra_reach = [0.0 for _ in parameters]  # additional movement caused by pushes and impacts
         self._run_broad_phase(0)
         self._next = 0
@@ -207,7 +207,7 @@ class Collisions:
         return sorted(found)
 
     def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
-        """Push a drone out of solids; return whether it may exceed the broad phase's reach in the remaining time."""
+        """Push a drone out of solids; return whether it might leave the broad phase's reach in the remaining time."""
         bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
         x, y, z = start = bodies.position[:, drone].tolist()
         height, climb = z, float(self._vz[drone])
@@ -234,7 +234,7 @@ class Collisions:
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
-            # (A moving platform may overlap the drone afterwards, because it can't be clear of both.)
+            # (A moving platform may overlap the drone afterwards: the drone can't be clear of both.)
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
         self._x[drone], self._y[drone], self._z[drone] = x, y, z
@@ -243,15 +243,15 @@ class Collisions:
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a wedged drone, which can't be pushed out of one object without entering another.
 
-        Horizontally the drone returns to its last clear position. Vertically it stays free, because nothing that it is
-        wedged between supports it. There is no friction: in a narrow enough corner the pressure would grow without
-        limit and hold the drone in the air forever.
+        Horizontally the drone returns to its last clear position. Its vertical motion stays free, because the objects
+        that wedge it in don't support it. There is no friction: in a narrow enough corner the pressure would grow
+        without limit and hold the drone in the air forever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
         self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
-        # All faces are horizontal or vertical, so one of them is above or below.
+        # All faces are horizontal or vertical, so the drone is blocked from above or below.
         self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
@@ -287,7 +287,7 @@ class Collisions:
         return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
-        """Make a turning surface take the drone on it along, by friction over the whole contact disk.
+        """Rotate the drone along with the turning surface below it, by friction over the whole contact disk.
 
         With pressure p = F / πR², the torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
@@ -297,7 +297,7 @@ class Collisions:
     # Drones ----------------------------------------------------------------------------------------------------
 
     def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
-        """Separate overlapping drones; return whether one may exceed the broad phase's reach in the remaining time."""
+        """Separate overlapping drones; return whether one might leave the broad phase's reach in the remaining time."""
         strayed = False
         for one, other in self._close_pairs():
             if self._separate(one, other, left_s, contacts):
@@ -318,7 +318,7 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one may exceed the broad phase's reach in the remaining time."""
+        """Separate two drones; return whether one might leave the broad phase's reach in the remaining time."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -328,7 +328,7 @@ class Collisions:
         upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
         depth = -max(across, upright)
         if depth <= 0.0:
-            return False  # pushed apart by a third drone
+            return False  # a third drone pushed them apart
         if across > upright:
             nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
         else:

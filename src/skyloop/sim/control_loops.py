@@ -60,7 +60,7 @@ class Sensors:
         self.velocity: Floats = self._estimate[1:]  #: velocity forward, left, up in levelled axes, (3, n) [m/s]
         self._few = few(n)
         if self._few:
-            self.numbers = Fields(self._estimate, 0, 4)  #: for a few drones: altitude and velocity
+            self.numbers = Fields(self._estimate, 0, 4)  #: altitude and velocity, for a few drones
             self._each = list(enumerate(self._half_height.tolist()))
         self.estimate()
 
@@ -87,7 +87,7 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def put(self, drone: int) -> None:
-        """Measure a drone that was moved and is at rest, because its last estimate was for another position."""
+        """Replace the estimate of a drone that was moved and is at rest: the old one is for another position."""
         height = self._bodies.position[2, drone] - self._half_height[drone]
         self._estimate[:, drone] = self._bias[9:, drone]
         self._estimate[0, drone] += height
@@ -100,7 +100,7 @@ class Sensors:
         """
         if step != self._inertial_step:
             bodies = self._bodies
-            # Drone after drone, so that adding drones doesn't change the noise of the earlier ones.
+            # Draw for one drone after another, so that adding drones doesn't change the noise of the earlier ones.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
             truth = np.concatenate([bodies.body_rates(), bodies.specific_force(), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
@@ -119,17 +119,17 @@ def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> 
 
 
 _REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehicle
-_HELD_M = 0.25  # distance behind its descent from which a landing drone counts as held
+_HELD_M = 0.25  # minimum distance behind its descent at which a landing drone counts as held
 _HELD_CLIMB_M_S = 0.15  # maximum climb rate of a held drone; a faster one is still on its way
 _HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
-_HELD_REGAIN = 4.0  # factor by which it recovers faster; otherwise it would drop when released
+_HELD_REGAIN = 4.0  # factor by which the lag shrinks faster; otherwise the drone would drop when released
 _INTEGRATED_ERROR_M_S = 0.25  # limit of the integrated error: braking must not wind up the integral
-_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, in case a wall holds the drone
+_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, for when a wall holds the drone back
 
 
 _ROWS = 15  # rows of the table: set-points, limits and the loops' state
 _STATE = 11  # first row of the loops' state
-_LANDING = 10  # row that is greater than 0 while landing
+_LANDING = 10  # index of the row that is greater than 0 while landing
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class ControlLoops:
         self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
         self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
         self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
-        # The last row is how far a landing drone is above its expected descent.
+        # The last row is the height of a landing drone above its expected descent.
         self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
         self._rows = tuple(table)
         self._by_velocity[:] = 1.0
@@ -268,7 +268,7 @@ class ControlLoops:
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Roll and pitch for the horizontal velocity. The integral is in world axes, where turning leaves wind as is.
+        # Get roll and pitch from the velocity error. The integral is in world axes, where yaw doesn't affect wind.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S
@@ -279,7 +279,7 @@ class ControlLoops:
         pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
-        if self._any_level_brake:  # drones flown by attitude lean against their speed
+        if self._any_level_brake:  # drones under attitude control lean against their motion
             brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
@@ -299,7 +299,7 @@ class ControlLoops:
         return commands, (reference, east, north, behind)
 
     def _fall_behind(self, do: Operations, climbing: N, descent: N, behind: N) -> N:
-        """Return how far a held landing drone is behind its descent [m], which reduces its thrust."""
+        """Return how far a landing drone that is held up lags behind its descent [m], which reduces its thrust."""
         error = climbing - descent
         held = do.choose(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
         most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2
@@ -307,6 +307,6 @@ class ControlLoops:
 
 
 def _brake(do: Operations, lean: N, set_point: N, tilt_limit: N) -> N:
-    """Return the additional lean against the speed on one axis, beyond the set-point."""
+    """Return the additional lean against the motion on one axis, beyond the set-point."""
     share = do.most(1.0 - abs(set_point) / tilt_limit, 0.0)
     return do.least(do.most(lean, -tilt_limit), tilt_limit) * share

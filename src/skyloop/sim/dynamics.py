@@ -45,7 +45,7 @@ class Fields:
         numbers = Struct(f"{count}d")
         #: one function per drone that returns the drone's numbers
         self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
-        #: one function per drone that replaces its numbers; it takes as many numbers
+        #: one function per drone that replaces its numbers with the same number of values
         self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
 
 
@@ -65,9 +65,9 @@ ARRAYS: Final = Operations(np.minimum, np.maximum, np.sqrt, np.where)
 
 STEP_S = 0.004  # time step of the simulation (250 Hz)
 
-# Stored as arrays, because NumPy computes faster with them than with numbers.
+# Stored as arrays because NumPy computes faster with arrays than with Python numbers.
 _STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)
-_ROWS = 32  # rows of the table of a body's state and inputs
+_ROWS = 32  # number of rows in the table of a body's state and inputs
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
 _MOST_TILTING_AIRSPEED_M_S = 3.0  # the additional tilt stays constant above this airspeed, which no recording exceeds
 
@@ -78,7 +78,7 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
 
 
 class BodyTable(ABC):
-    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones."""
+    """State and inputs of the bodies, common to all kinds of dynamics. Rows are axes, columns are drones."""
 
     #: Upper bound of every body's acceleration, excluding collisions.
     most_acceleration_m_s2 = 60.0  # more than thrust, gravity and drag in a headwind of 10 m/s combined
@@ -91,7 +91,7 @@ class BodyTable(ABC):
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
         #: Input and actual value: thrust per mass, (n,) [m/s²].
         self.thrust_command, self.thrust = table[12], table[22]
-        #: Sines and cosines of the angles; input: velocity of the air, (3, n) [m/s].
+        #: Sines and cosines of the angles; as input, the velocity of the air, (3, n) [m/s].
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
         #: Position and velocity of the body's centre in world axes, (3, n) [m, m/s]; velocity before the last step.
         self.position, self.velocity, self.velocity_before = (table[row : row + 3] for row in (23, 26, 29))
@@ -180,8 +180,8 @@ class Bodies(BodyTable):
         damping = column(parameters, lambda p: p.attitude_damping)
         yaw_rate = 1.0 / column(parameters, lambda p: p.yaw_time_constant_s)
         ones, zeros = np.ones_like(frequency), np.zeros_like(frequency)
-        # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. For yaw
-        # the angle isn't held and the command is a rate.
+        # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. Yaw is
+        # different: the angle isn't held and the command is a rate.
         self._held = np.array([ones, ones, zeros])
         self._stiff_running = np.array([frequency**2, frequency**2, yaw_rate]) * STEP_S
         self._stiff[:] = self._stiff_running
@@ -325,7 +325,7 @@ class Bodies(BodyTable):
         np.cos(self.angles, out=self.cos)
 
     def _tilt_by_airspeed(self) -> Floats:
-        """Return the roll and pitch that the air adds to the commands, shape (2, n): the leading side rises."""
+        """Return the roll and pitch that the airflow adds to the commands, shape (2, n): it lifts the leading side."""
         east, north = self.velocity[:2] - self.air[:2]
         sin_yaw, cos_yaw = self.sin[2], self.cos[2]
         forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
@@ -369,7 +369,7 @@ class Bodies(BodyTable):
         np.add(self.position, total, out=self.position)
 
     def _lift(self) -> Floats:
-        """Return the lagged thrust, near the floor times 1 / (1 - (R / 4h)²): Cheeseman, Bennett 1955."""
+        """Return the lagged thrust, multiplied near the floor by 1 / (1 - (R / 4h)²) (Cheeseman, Bennett 1955)."""
         lift, shortfall = self._c, self._d
         np.subtract(self.thrust_command, self.thrust, out=lift)
         np.multiply(lift, self._motor_share, out=lift)

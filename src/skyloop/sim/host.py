@@ -1,4 +1,4 @@
-"""A world with drones that keeps time and is rendered, for the drones' observers (drivers and emulators)."""
+"""A world with drones that keeps its own time and is rendered for the drones' observers (drivers and emulators)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Report:
 
 
 class Observer(Protocol):
-    """Callbacks of a host, called on the thread that steps the world. They must return quickly and never raise."""
+    """Callbacks for a host, called on the thread that steps the world. They must return quickly and never raise."""
 
     def report(self, report: Report) -> None: ...
 
@@ -68,7 +68,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held by the stepping thread: an ending one may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
@@ -82,14 +82,14 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Reports come on the thread that steps the world, and the cameras' frames, for ``screen``, on the rendering
-        thread. A drone has one observer: for a second one this raises UsageError.
+        Reports arrive on the thread that steps the world, and ``screen`` gets the frames on the rendering thread. A
+        drone has one observer: for a second one this raises UsageError.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
             if drone in self.observers:
-                raise UsageError(f"drone {drone} of this world is taken already")
+                raise UsageError(f"drone {drone} of this world is already taken")
             cameras = self._cameras(drone, screen, models)
             self.observers = {**self.observers, drone: (observer, cameras)}
             if self._stepper is None:
@@ -97,7 +97,7 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; any other than the attached one is ignored. The last one stops the world.
+        """Stop reporting to an observer; do nothing if it is not the attached one. The last one stops the world.
 
         No report is running when this returns.
         """
@@ -142,7 +142,7 @@ class Stepper(Protocol):
 
 
 class ReportPublisher:
-    """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
+    """Publishes reports to a host's observers and triggers the cameras that are due after each batch of steps."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Pipeline]) -> None:
         """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""
@@ -153,7 +153,7 @@ class ReportPublisher:
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish the reports and exposures that are due for the state at a time on the observers' clock."""
+        """Publish the reports and exposures that are due at a time on the observers' clock."""
         simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
             if occurrence.drone in observers:
@@ -190,7 +190,7 @@ class ReportPublisher:
 
 
 class _RealTimeStepper:
-    """A world in real time: one thread steps it and publishes reports, another one renders."""
+    """Runs a world in real time: one thread steps it and publishes reports, and another one renders."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
@@ -225,7 +225,7 @@ class _RealTimeStepper:
         self._slowness = SlownessWatch(monotonic_ns())
         self._begun_s = self._simulation.time_s
         try:
-            least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs even steps
+            least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs evenly timed steps
             while not self._stop.wait(max(self._pacer.run_due(), least_s)):
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))

@@ -1,6 +1,6 @@
 """A rotor-level drone's instruments as read by its firmware, with noise, bias, rate and delay.
 
-The origin of every world is the same place on Earth: in Zürich, where PX4's simulations start by default.
+All worlds have their origin at the same place on Earth: in Zürich, where PX4's simulations start by default.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ class Readings(msgspec.Struct, frozen=True, gc=False):
     pressure_pa: float
     temperature_c: float
     magnetic_gauss: Vec3  #: magnetic field in body axes
-    gps: GpsFix | None  #: a new fix, only in the step in which it arrives
+    gps: GpsFix | None  #: a new fix; None except in the step in which it arrives
     range_m: float | None  #: distance down along the body's axis to the floor or a solid; None if out of range
-    flow: FlowSample | None  #: a new sample, only in the step in which it arrives
+    flow: FlowSample | None  #: a new sample; None except in the step in which it arrives
     battery_v: float
     battery_a: float
     position_m: Vec3  #: true position of the body's centre
@@ -82,7 +82,7 @@ class Firmware(Protocol):
         lock. It must return in bounded time and call no method of the simulation.
 
         Args:
-            readings: The readings at the beginning of the step.
+            readings: The readings at the start of the step.
 
         Returns:
             Rotor commands, 0 (stopped) to 1 (full): front left, front right, rear left, rear right. Values outside this
@@ -98,7 +98,7 @@ LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
 LONGITUDE_DEG: Final = 8.545594
 ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
-#: The Earth's magnetic field there, east, north, up, from the World Magnetic Model 2025 for early 2026.
+#: The Earth's magnetic field at the worlds' origin, east, north, up, from the World Magnetic Model 2025 for early 2026.
 MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
 
 _EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
@@ -127,7 +127,7 @@ def geodetic(position_m: Vec3) -> Vec3:
 
 
 def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-    """Return the position in world axes, as the inverse of :func:`geodetic`."""
+    """Return the position in world axes, the inverse of :func:`geodetic`."""
     north = (latitude_deg - LATITUDE_DEG) / _DEG_PER_NORTH_M
     return (longitude_deg - LONGITUDE_DEG) / _DEG_PER_EAST_M, north, altitude_m - ALTITUDE_M
 
@@ -142,7 +142,7 @@ def pressure_pa(height_m: float) -> float:
 Ranging = Callable[[Vec3, Vec3], float]
 
 _NOISE_BLOCK = 256  # number of samples whose noise is drawn in one call
-_WANDER_STEPS = 100  # interval between changes of the biases (10 Hz), in steps
+_WANDER_STEPS = 100  # number of steps between changes of the biases (10 Hz)
 _LEAST_FLOW_M = 0.08  # minimum height; any lower, the image is out of focus
 _GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal one
 _SATELLITES = 14
@@ -182,12 +182,12 @@ class Instruments:
             )
         )
         self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
-        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step in which it arrives
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # fixes, each with the step in which it arrives
         self._magnetic: Vec3 = (0.0, 0.0, 0.0)
         self._pressure_pa = 0.0
         self._below_m = math.inf
         self._range_m: float | None = None
-        self._turned = (0.0, 0.0, 0.0, 0.0)  # since the last flow sample, about forward and left: true, then gyro
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # rotation about forward and left: true, then gyro
         self._first = -1
 
     def read(

@@ -1,4 +1,4 @@
-"""True image boxes of objects in a simulated camera's view, with their visible part, for training, tests, benchmarks.
+"""True image boxes of objects in a camera's view, with visible fractions, for training, tests and benchmarks.
 
 They are drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the
 pixels that each would cover if nothing occluded it.
@@ -27,7 +27,7 @@ from skyloop.sim.world import FigureTarget, TargetState, World
 
 CLASS_NAMES = ("person", "car", "box")  #: label classes; those of boards and platforms are not included
 _CLEAR_M = 0.35  # minimum distance between a camera and solids
-_LONGEST_STEP_S = 20.0  # maximum time between two images of ``pictures``; tracks keep only 60 s
+_LONGEST_STEP_S = 20.0  # maximum time between two images from ``pictures``; tracks keep only 60 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class TargetBox:
     #: x, y of the upper left corner, width and height [px] of the object's whole extent within the image
     box: tuple[int, int, int, int]
     visible: float  #: fraction of the object's pixels within the image that are not occluded, 0 to 1
-    cut: bool  #: whether the image's edge may cut the object off, because it reaches the outermost pixels
+    cut: bool  #: whether the object reaches the outermost pixels, so that the image's edge may cut it off
 
 
 class Labeller:
@@ -93,7 +93,7 @@ def pictures(
     size: tuple[int, int] = (320, 240),  # width and height of the images [px]
     focal_share: float = 0.75,  # focal length as a fraction of the width
     *,
-    # camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out
+    # camera to use instead of ``size`` and ``focal_share``, but without its sensor's imperfections
     camera: CameraModel | None = None,
     tilt_rad: float | None = None,  # maximum random pitch and roll, in either direction
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:

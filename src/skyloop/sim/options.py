@@ -16,7 +16,7 @@ from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-#: The simulated vehicles' own actions; the proxy flies them to positions and back to the start.
+#: Actions that simulated vehicles support natively; the proxy flies them to positions and back to the start.
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
 MOST_LAG_S: Final = 0.25  #: default for the lag behind the clock beyond which steps are skipped
@@ -30,8 +30,8 @@ class SimOptions:
     seed: int = 0  #: seed for all noise and gusts
     speed: float = 1.0  #: ratio of simulated to real time
     cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
-    noise: float = 1.0  #: factor on the sensors' noise and biases
-    wind: float = 1.0  #: factor on the world's wind
+    noise: float = 1.0  #: factor applied to the sensors' noise and biases
+    wind: float = 1.0  #: factor applied to the world's wind
     battery: float = 1.0  #: charge at the start, 0 to 1
     quality: str = "smooth"  #: image quality: ``fast``, ``smooth`` or ``best``
     native: frozenset[str] = EVERY_ACTION  #: actions that the drone's driver supports natively
@@ -60,17 +60,17 @@ class SimOptions:
         return with_scaled_flaws(self.parameters, self.noise)
 
 
-_LONGEST_RUN_STEPS = 25  # maximum number of steps per call at real time
-SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation is too slow,
-SLOW_NS = 5 * NS_PER_S  #: the time over which that is measured,
-SLOW_AGAIN_NS = 60 * NS_PER_S  #: and the interval between warnings
+_LONGEST_RUN_STEPS = 25  # maximum number of steps per call when running in real time
+SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation counts as too slow
+SLOW_NS = 5 * NS_PER_S  #: time over which the speed is measured
+SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
 
 
 class Pacer:
     """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are made up for. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in ``lost_s``, and
-    the deadlines move. Not thread-safe: one thread owns the pacer::
+    The pacer catches up on small delays. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in
+    ``lost_s``, and the deadlines are postponed. Not thread-safe: one thread owns the pacer::
 
         while not stop.wait(pacer.run_due()):
             publish()
@@ -84,7 +84,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store ``step(n)``, which does n steps, and ``speed``, the seconds of simulation per second of the clock."""
+        """Store ``step(n)``, which runs n steps, and ``speed``, the simulated seconds per second of the clock."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step
@@ -106,7 +106,7 @@ class Pacer:
             self._start_ns += round(excess)
             self.lost_s += excess / NS_PER_S
             behind -= round(excess)
-        # At high speeds a batch is longer, so that control doesn't return for every step.
+        # At high speeds, use longer batches, so that control returns less often than once per step.
         most = max(_LONGEST_RUN_STEPS, int(_LONGEST_RUN_STEPS * self._speed))
         steps = min(int(behind / self._ns_per_step) + 1, most)
         self._step(steps)
@@ -114,7 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Return when the simulation reached, or will reach, a time since this pacer's start, on the clock."""
+        """Return the clock time at which the simulation reached, or will reach, a time since this pacer's start."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:
@@ -122,7 +122,7 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure."""
+    """Detects that the computer is too slow for a simulation, from the time that its :class:`Pacer` skipped. Pure."""
 
     def __init__(self, now_ns: int) -> None:
         self._since_ns = now_ns
@@ -130,7 +130,7 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None."""
+        """Return the achieved fraction of the simulation's speed if a warning is due, otherwise None."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None

@@ -1,4 +1,4 @@
-"""Parameters of a simulated vehicle for its flight, its rotors and its instruments.
+"""Parameters that describe a simulated vehicle's flight, rotors and instruments.
 
 The defaults describe an AR.Drone 2 with its indoor hull, as far as public sources go. Values without a source are
 marked as estimates.
@@ -31,7 +31,7 @@ Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tu
 class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
-    ``noise`` is the standard deviation of a sample. ``bias`` is that of the error at the start of a flight, which then
+    ``noise`` is the standard deviation of a sample, and ``bias`` that of the initial error of a flight, which then
     wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
     """
 
@@ -82,8 +82,8 @@ class RotorParameters:
     full_speed_rad_s: float  #: speed at full command
     speed_up_s: float  #: time constant of an accelerating rotor
     speed_down_s: float  #: time constant of a decelerating rotor
-    #: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. Its causes
-    #: are blade flapping and the blades' asymmetric drag.
+    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. It is
+    #: caused by blade flapping and the blades' asymmetric drag.
     rotor_drag_kg: float
     rotor_inflow_kg: float  #: the same along the rotors' axes, where air from above reduces the thrust
     body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
@@ -144,15 +144,15 @@ class VehicleParameters:
     """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
-    mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
+    mass_kg: float = 0.42  # includes the indoor hull [P]; used only when drones collide; everything else is per mass
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
-    linear_drag_per_s: float = 0.45  # together with the next one: 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
+    linear_drag_per_s: float = 0.45  # with the next value, gives 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large
-    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. It is this
-    # angle times the square of the horizontal airspeed, up to 3 m/s, caused by blade flapping and wind on the hull.
+    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. The tilt is
+    # this angle times the square of the horizontal airspeed, up to 3 m/s; blade flapping and wind on the hull cause it.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
@@ -160,16 +160,16 @@ class VehicleParameters:
     rotor_height_m: float = 0.05  # height of the rotors above the feet, for the ground effect; estimate
     ground_effect: float = 1.0  # fraction of the effect of one rotor with this radius [C]; 0 switches it off
     motor_time_constant_s: float = 0.06  # estimate
-    most_thrust: float = 1.9  # as a multiple of the weight, with a full battery; estimate
-    least_thrust: float = 0.3  # as a fraction of the weight, while the motors are running; estimate
+    most_thrust: float = 1.9  # maximum thrust as a multiple of the weight, with a full battery; estimate
+    least_thrust: float = 0.3  # minimum thrust as a fraction of the weight while the motors run; estimate
 
     # Inner loops
-    attitude_frequency_rad_s: float = 16.0  # together with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
+    attitude_frequency_rad_s: float = 16.0  # gives, with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
-    # With roll and pitch set-points near level, firmware may lean against the speed: this is the deceleration per speed
-    # at a level set-point; it decreases in proportion to the tilt and is zero at the full tilt.
+    # Near level roll and pitch set-points, the firmware may lean against the motion: this is the deceleration per speed
+    # at a level set-point, which decreases in proportion to the tilt and is zero at full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
@@ -183,7 +183,7 @@ class VehicleParameters:
     battery_full_v: float = 12.5
     battery_empty_v: float = 9.6
     battery_resistance_ohm: float = 0.08  # estimate
-    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the electronics
+    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the power of the electronics
     electronics_power_w: float = 5.0  # estimate
 
     # Sensors: standard deviations of the noise, and of biases that wander with the time constant. Estimates for
@@ -207,8 +207,8 @@ class VehicleParameters:
     restitution: float = 0.35  # fraction of the normal speed after a bounce; estimate
     friction: float = 0.5  # Coulomb friction; estimate
 
-    #: Rotors of a vehicle that is modelled down to them (``docs/rotors.md``); None models its response as a whole. With
-    #: rotors, the drag, motor time constant and hover power above have no effect; the rotors' own values count.
+    #: Rotors of a vehicle modelled at rotor level (``docs/rotors.md``); None models its response as a whole. If
+    #: there are rotors, their own values replace the drag, motor time constant and hover power above.
     rotors: RotorParameters | None = None
 
     def __post_init__(self) -> None:
@@ -228,8 +228,8 @@ class VehicleParameters:
             raise UsageError("battery_empty_v must be below battery_full_v")
         if self.rotors is not None and not self.most_thrust < self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):
             raise UsageError(
-                f"most_thrust {self.most_thrust:g} of the weight must be below what the rotors give, "
-                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: the attitude needs the rest"
+                f"most_thrust {self.most_thrust:g} of the weight must be below the rotors' maximum, "
+                f"{self.rotors.full_thrust_n / (self.mass_kg * GRAVITY_M_S2):.2f}: attitude control needs the rest"
             )
 
 

@@ -1,4 +1,4 @@
-"""A simulation's reports about its drones: their own estimates, the truth, and occurrences."""
+"""A simulation's reports on its drones: their own estimates, the true state, and occurrences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class VehicleFeedback:
 
     time_s: float  #: simulation time
     state: FlightState
-    emergency_reason: str  #: why the motors were cut; empty in other states
+    emergency_reason: str  #: reason why the motors were cut; empty in other states
     battery: float  #: remaining charge, 0 to 1
     battery_v: float
     roll_rad: float
@@ -49,7 +49,7 @@ class VehicleTruth:
 
 
 class OccurrenceKind(StrEnum):
-    """Kinds of occurrences."""
+    """Types of occurrences."""
 
     COLLISION = "collision"
     EMERGENCY = "emergency"

@@ -1,4 +1,4 @@
-"""Formulas of the rotor-level model, both for the numbers of one drone and for arrays of all drones. Pure.
+"""Formulas of the rotor-level model, which work for the numbers of one drone and for arrays of all drones. Pure.
 
 Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give the
 same bits for numbers and arrays.
@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant that slower rotors get because the mixer commands them beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays of those of all. Forces and torques are per mass and per inertia."""
+    """Constants of one drone, or arrays for all drones. Forces and torques are per mass and per inertia."""
 
     thrust: N
     idle_speed: N
@@ -110,7 +110,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
     rows = [[1.0] * 4, ys, [-x for x in xs], [rotors.torque_m * sign for sign in YAW_SIGNS]]
     _, roll, pitch, yaw = (np.linalg.inv(np.array(rows)) * (1.0, ix, iy, iz)).T.tolist()
-    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # of the rotors
+    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # values for each rotor
     return Constants(
         thrust=k,
         idle_speed=rotors.idle_speed_rad_s,
@@ -188,7 +188,7 @@ def advance(
     twist: N,  # reaction of the rotors; see :func:`spin`
     motion: Sequence[N],  # velocity of the air, position and velocity in world axes
     knock: Three,  # acceleration in world axes by which contacts changed the body's velocity in the last step
-    legs: bool,  # whether any drone may be standing or lying on something that turns it onto its feet
+    legs: bool,  # whether any drone may be touching something that turns it onto its feet
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
 
@@ -202,7 +202,7 @@ def advance(
     knock_x, knock_y, knock_z = knock
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(w, x, y, z)
 
-    # The air along the body's axes and, at each rotor, along its own: a rotor's force follows [M], less inflow [S].
+    # Airspeed along the body's axes and, at each rotor, along its axis: a rotor's force follows [M], less inflow [S].
     east, north, up = vx - air_x, vy - air_y, vz - air_z
     ahead = r00 * east + r10 * north + r20 * up
     aside = r01 * east + r11 * north + r21 * up
@@ -217,7 +217,7 @@ def advance(
     t4 = t4 - inflow * s4 * (along + p * c.y4 - q * c.x4)
     thrust = t1 + t2 + t3 + t4
 
-    # Near the floor thrust grows by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow downwards.
+    # Near the floor, thrust grows by 1 / (1 - (R / 4h)²) [C], scaled by the downward component of the rotors' axis.
     shortfall = c.ground_effect / do.most(pz + c.rotor_offset, c.rotor_height)
     lift = thrust / (1.0 - shortfall * shortfall * do.most(r22, 0.0))
     flapping = c.rotor_drag * (s1 + s2 + s3 + s4)
@@ -260,8 +260,8 @@ def advance(
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
     """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
 
-    If the rotors can't do everything, roll and pitch come first, then the thrust per mass (at 0 the rotors stop); yaw
-    gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch take precedence, then the thrust per mass (at 0 the rotors stop);
+    yaw gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -296,7 +296,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
 
 
 def electric_power(c: Constants, speeds: Four) -> N:
-    """Return the battery power for the rotors at these speeds and the electronics [W]."""
+    """Return the battery power for the electronics and for the rotors at these speeds [W]."""
     s1, s2, s3, s4 = speeds
     return (s1 * s1 * s1 + s2 * s2 * s2 + s3 * s3 * s3 + s4 * s4 * s4) * c.shaft_power + c.electronics_power
 

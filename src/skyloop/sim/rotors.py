@@ -1,6 +1,6 @@
-"""Bodies modelled down to their four rotors in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
+"""Bodies modelled at rotor level in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
 
-As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays and a few one by one, with the same bits.
+As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays, a few one by one, with bit-identical results.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
-# First rows, and number, of the table of a body's state and inputs, in addition to those of BodyTable.
+# First rows of the entries that this table adds to BodyTable's, and its total number of rows.
 _TURNING, _SPEEDS, _TARGETS, _ROWS = 0, 7, 16, 29
-_AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; cosine near the vertical
+_AIR, _LEAST_COS = 19, 1e-6  # BodyTable's first row of air, thrust, position, velocity; minimum cosine
 _IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %
 _ROTOR_MARGIN_M_S2 = 60.0  # margin for gravity, ground effect, and drag in a fast dive
 
@@ -112,13 +112,13 @@ class RotorBodies(BodyTable):
         self._targets[:, drone] = [idle + span * min(one, 1.0) if one > 0.0 else 0.0 for one in commands]
 
     def idles(self, drone: int) -> bool:
-        """Return whether no rotor of a drone flown by firmware is commanded above the idle speed of armed firmware."""
+        """Return whether a drone's firmware commands all rotors at or below the idle speed of armed firmware."""
         constants = self._constants[drone]
         idle = constants.idle_speed + _IDLE_COMMAND * (constants.full_speed - constants.idle_speed)
         return bool((self._targets[:, drone] <= idle + 1e-9).all())
 
     def set_unloaded_voltage(self, voltage: Floats) -> None:
-        """Set the batteries' voltage without a load, (n,) [V]; that of empty ones is zero."""
+        """Set the batteries' open-circuit voltage, (n,) [V], which is zero for empty ones."""
         self._open_voltage[:] = voltage
 
     def turn(self, drone: int, change_rad_s: float) -> None:
@@ -240,7 +240,7 @@ class RotorBodies(BodyTable):
 
     def _derive(self) -> None:
         """Compute angles, with their sines, cosines and derivatives, from the quaternions."""
-        # In separate arrays, because NumPy's functions may give different bits for different strides.
+        # Kept in separate arrays, because NumPy's functions may give different bits for different strides.
         quaternion = np.ascontiguousarray(self.quaternion)
         (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation(*quaternion)
         level = np.sqrt(r21 * r21 + r22 * r22)
@@ -252,7 +252,7 @@ class RotorBodies(BodyTable):
         if steep.any():  # roll and yaw turn about the same axis, so all of it counts as yaw
             sin[0, steep], sin[2, steep] = 0.0, -r01[steep]
             cos[0, steep], cos[1, steep], cos[2, steep] = 1.0, _LEAST_COS, r11[steep]
-        cos[0, cos[0] == 0.0] = _LEAST_COS  # a divisor of thrust
+        cos[0, cos[0] == 0.0] = _LEAST_COS  # avoids a division by zero
         self.angles[:] = np.arctan2(sin, cos)
         self.sin[:], self.cos[:] = sin, cos
         p, q, r = self.turning
@@ -272,7 +272,7 @@ class _Pilot:
     def exchange(self) -> None:
         bodies, drone = self._bodies, self._drone
         w, x, y, z = bodies.quaternion[:, drone].tolist()
-        # The ground supports a drone only at the end of each simulation step; between these, it falls.
+        # The ground supports a drone only at the end of each simulation step; in between, the drone falls.
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,

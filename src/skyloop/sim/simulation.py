@@ -39,7 +39,7 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query."""
+    """A world with drones. All methods may be called from any thread: each step or query holds a lock."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class Simulation:
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """Change a drone's limits from the next command on. The ceiling applies immediately."""
+        """Change a drone's limits from the next command on. A new ceiling takes effect immediately."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
 
@@ -194,7 +194,7 @@ class Simulation:
                 )
             if not self._autopilot.grounded(drone, self.time_s):
                 state = self._autopilot.states[drone]
-                raise UsageError(f"drone {drone} is in the air ({state}): firmware takes over on the ground")
+                raise UsageError(f"drone {drone} is in the air ({state}): firmware can take over only on the ground")
             solids, rotors = self._solids, self._rotors
 
             def ranging(point: Vec3, direction: Vec3) -> float:
@@ -240,7 +240,7 @@ class Simulation:
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
         """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
-        The position is that of its centre in world axes. A drone that is not flying raises UsageError.
+        ``position_m`` is where its centre goes, in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -313,8 +313,8 @@ class Simulation:
     def motions(self) -> tuple[Floats, Floats, Floats]:
         """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
-        They are true positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up,
-        up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
+        Positions are true values in world axes, shape (n, 3) [m]; velocities forward, left and up are the drones'
+        estimates, up to 12 ms older, shape (n, 3) [m/s]; roll, pitch and yaw (within ±π) are true, shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()
@@ -357,7 +357,7 @@ def _one_each(given: T | Sequence[T], drones: int, what: str) -> list[T]:
 
 
 def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
-    """Return whether the vehicles are modelled down to their rotors."""
+    """Return whether the vehicles are modelled at rotor level."""
     have = {vehicle.rotors is not None for vehicle in parameters}
     if len(have) > 1:
         raise UsageError("vehicles with and without rotors (VehicleParameters.rotors) need separate simulations")

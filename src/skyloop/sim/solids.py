@@ -39,14 +39,14 @@ class Solids:
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
-        # The same as plain numbers, which are faster for a single box: centre, half the size, cosine and sine of yaw;
-        # velocity and turn rate.
+        # The same values as plain numbers, which are faster for a single box: centre, half the size, cosine and sine of
+        # yaw; velocity and turn rate.
         self._boxes = [(0.0,) * 8 for _ in sizes]
         self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
             self._place(number, box.position_m, box.yaw_rad)
         self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
-        self._bounded_m = math.nan  # radius for which they are valid
+        self._bounded_m = math.nan  # radius for which ``_bounds`` is valid
         size_x, size_y, height = world.room.size_m
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
@@ -71,9 +71,9 @@ class Solids:
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
         """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
 
-        Moving solids stay within theirs for so many seconds, and a hull of that radius touches a box only if their
-        bounding boxes overlap. (The distance between a hull and a turned box's corner is that of a square turned the
-        same way.)
+        Moving solids stay within their boxes for ``seconds``, and a hull of ``radius_m`` touches a solid only if their
+        bounding boxes overlap. (To find the distance between a hull and a turned box's corner, treat the hull as a
+        square turned the same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -95,8 +95,8 @@ class Solids:
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
         """Return which of the points (3, m), m > 0, are inside their solids, as indices in ascending order.
 
-        Each point has the number of its solid, (m,), and its sizes, from :meth:`sizes` for the same numbers and its
-        hull.
+        For each point, ``numbers`` has the index of its solid, (m,), and ``sizes`` the result of :meth:`sizes` for that
+        solid and the point's hull.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -105,14 +105,14 @@ class Solids:
         return found
 
     def sizes(self, numbers: Indices, hulls: Floats) -> Floats:
-        """Return half the sizes of solids with hulls (3, m) around them, shape (3, m)."""
+        """Return the half sizes of solids enlarged by hulls (3, m), shape (3, m)."""
         grown: Floats = self._half[:, :, 0].take(numbers, axis=1) + hulls
         return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance of drones at points (3, m) to the nearest solid, wall or ceiling, (m,).
 
-        It is never more than the true distance, and negative inside a solid. ``hulls`` are radius, radius, half height,
+        It never exceeds the true distance, and is negative inside a solid. ``hulls`` are radius, radius, half height,
         (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
@@ -125,7 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all); None without one."""
+        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all), if there is one."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None
@@ -156,9 +156,9 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite without one.
+        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite if none.
 
-        It is 0 from a point below the floor.
+        The distance is 0 if the point is below the floor.
         """
         if self._movers:
             self.move(time_s)
@@ -189,7 +189,7 @@ class Solids:
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
         if number >= self.fixed and self._lifts[number - self.fixed] and local[2] > 0:
-            axis = 2  # a platform lifts everything on it, however it moves
+            axis = 2  # a platform lifts everything on it, whichever way it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
         if axis == 2:
@@ -232,19 +232,19 @@ Indices = NDArray[np.intp]
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
     """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
 
-    Boxes go from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one of a pair is among the
-    first ``movable`` ones. The pairs' lower and higher numbers are in ascending order.
+    Boxes extend from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one box of each pair is
+    among the first ``movable`` boxes. Pairs are sorted by their lower, then their higher number.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
     order = low[axis].argsort(kind="stable")
     begins, ends = low[axis, order], high[axis, order]
-    # In this order, a box overlaps along the axis with later ones that begin before it ends.
+    # In this order, a box overlaps, along the axis, the later boxes that begin before it ends.
     numbers = np.arange(len(order))
     counts = begins.searchsorted(ends, side="right") - numbers - 1
     first = numbers.repeat(counts)
-    before = counts.cumsum() - counts  # number of pairs with the previous boxes
+    before = counts.cumsum() - counts  # number of pairs contributed by the preceding boxes
     second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
     one, other = order.take(first), order.take(second)
     for across in {0, 1, 2} - {axis}:
@@ -292,7 +292,7 @@ def _fill(
 
 
 def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[float, float]]:
-    """Return points of a square grid over the floor, those nearest to ``around`` first."""
+    """Return points of a square grid over the floor, starting with those nearest to ``around``."""
     x0, y0 = around.position_m[:2] if around else (0.0, 0.0)
     reach_x, reach_y = (math.ceil(world.room.size_m[axis] / spacing) for axis in (0, 1))
     points = [

@@ -30,7 +30,7 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
-    """Return the stream for a purpose and a number (of a drone, target, camera or step). This takes some 15 µs.
+    """Return the random stream for a purpose and an index (of a drone, target, camera or step). This takes about 15 µs.
 
     The same arguments give the same stream in all versions.
     """
@@ -38,7 +38,7 @@ def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
 
 
 class NormalBlocks:
-    """Standard normal numbers for many drones, ``rows`` at a time for each. Every drone has its own stream.
+    """Standard normal random numbers for many drones, ``rows`` per drone at a time. Every drone has its own stream.
 
     They are drawn in blocks, because a call to a generator costs as much as a hundred numbers.
     """
@@ -51,7 +51,7 @@ class NormalBlocks:
         self._next = ahead
 
     def take(self) -> Floats:
-        """Return the next numbers, shape (rows, drones). The next block overwrites them, so copy those to keep."""
+        """Return the next numbers, shape (rows, drones). The next block overwrites them, so copy any that you keep."""
         if self._next == len(self._block):
             for drone, draw in enumerate(self._draws):
                 self._block[:, :, drone] = draw((len(self._block), self._rows))

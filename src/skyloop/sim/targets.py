@@ -36,7 +36,7 @@ from skyloop.sim.world import (
 )
 
 GRID_S = 0.02  # spacing of the points, between which motion is linear
-KEPT_S = 60.0  # duration of the past that is available for a target
+KEPT_S = 60.0  # length of the history that is available for a target
 
 _TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
 _RING_STEP_RAD = (math.radians(20), math.radians(45))
@@ -67,7 +67,7 @@ class TargetTrack:
         yaw = wrap_angle(heading + part * (next_heading - heading))
         walked += part * (next_walked - walked)
         place = (position[0], position[1], position[2])
-        # Use the velocity between the points, not at the first one; otherwise a drone on a platform would creep.
+        # Use the velocity between the points rather than at the first; otherwise a drone on a platform would creep.
         velocity = vec3((np.array(there) - np.array(here)) / GRID_S)
         rate = (next_heading - heading) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
@@ -95,7 +95,7 @@ def top_speed(path: Path) -> float:
 
 
 def _positions(path: Path, rng: np.random.Generator) -> Iterator[tuple[Vec3, Vec3]]:
-    """Yield position and velocity at 0, GRID_S, 2 GRID_S … endlessly."""
+    """Yield position and velocity at 0, GRID_S, 2 GRID_S … without end."""
     if isinstance(path, WaypointPath):
         return _waypoints(path)
     if isinstance(path, CirclePath):

@@ -1,6 +1,6 @@
-"""Vehicles with a response identified from recorded flights, and vehicles modelled down to their rotors.
+"""Vehicles whose response was identified from recorded flights, and vehicles modelled at rotor level.
 
-Parameters not given here have their defaults. A table in ``docs/rotors.md`` lists those of the rotor-level vehicles.
+Parameters not given here have their defaults. ``docs/rotors.md`` has a table of those for the rotor-level vehicles.
 
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
@@ -31,14 +31,14 @@ AR_DRONE = VehicleParameters(
     level_brake_per_s=0.303,
 )
 
-#: A 5-inch racing quadrotor with a four-cell battery: 4.6 times its weight in thrust.
+#: A 5-inch racing quadrotor with a four-cell battery and a maximum thrust of 4.6 times its weight.
 RACER = VehicleParameters(
     mass_kg=0.75,  # [L]
     radius_m=0.19,  # half the diagonal between the rotors, 0.125 m [L], plus a rotor's radius
     half_height_m=0.04,  # estimate
     rotor_radius_m=0.0648,  # 5.1 inch across [N]
     rotor_height_m=0.06,  # estimate
-    most_thrust=3.8,  # leaves a sixth of the rotors' thrust for the attitude; estimate
+    most_thrust=3.8,  # leaves a sixth of the rotors' thrust for attitude control; estimate
     least_thrust=0.15,  # estimate
     attitude_frequency_rad_s=22.0,  # estimate for rotors with this response
     attitude_damping=0.8,
@@ -65,14 +65,14 @@ RACER = VehicleParameters(
     ),
 )
 
-#: A 3DR Iris: 1.6 times its weight in thrust.
+#: A 3DR Iris, with a maximum thrust of 1.6 times its weight.
 IRIS = VehicleParameters(
-    mass_kg=1.52,  # including the rotors [R]
+    mass_kg=1.52,  # includes the rotors [R]
     radius_m=0.36,  # distance to the rotors [R] plus a rotor's radius
     half_height_m=0.055,  # 110 mm high [R]
     rotor_radius_m=0.1,  # [R]
     rotor_height_m=0.078,  # [R]: half the body's height plus 23 mm
-    most_thrust=1.45,  # leaves a tenth of the rotors' thrust for the attitude; estimate
+    most_thrust=1.45,  # leaves a tenth of the rotors' thrust for attitude control; estimate
     least_thrust=0.2,  # estimate
     attitude_frequency_rad_s=12.0,  # estimate
     attitude_damping=0.8,
@@ -94,20 +94,20 @@ IRIS = VehicleParameters(
         rotor_drag_kg=8.06428e-5,  # [R]
         rotor_inflow_kg=8.06428e-5,  # estimate: same as the drag across
         body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1; estimate
-        efficiency=0.8,  # estimate for some 20 minutes in the air
+        efficiency=0.8,  # estimate for about 20 minutes in the air
     ),
 )
 
-#: A Crazyflie 2: 1.7 times its weight in thrust.
+#: A Crazyflie 2, with a maximum thrust of 1.7 times its weight.
 CRAZYFLIE = VehicleParameters(
     mass_kg=0.028,  # [F]
     radius_m=0.069,  # 46 mm to the rotors' axes [F] plus a rotor's radius
     half_height_m=0.0145,  # 29 mm high [B]
     rotor_radius_m=0.0231,  # 46 mm across [B]
     rotor_height_m=0.02,  # estimate
-    most_thrust=1.5,  # leaves a seventh of the rotors' thrust for the attitude; estimate
+    most_thrust=1.5,  # leaves a seventh of the rotors' thrust for attitude control; estimate
     least_thrust=0.3,  # estimate
-    attitude_frequency_rad_s=17.0,  # together with the damping, steps like the mean of the three in [D]
+    attitude_frequency_rad_s=17.0,  # together with the damping, gives the mean step response of the three in [D]
     attitude_damping=0.67,
     most_angular_acceleration_rad_s2=150.0,  # estimate
     battery_charge_c=900.0,  # 250 mAh [B]
@@ -127,7 +127,7 @@ CRAZYFLIE = VehicleParameters(
         speed_down_s=0.072,
         rotor_drag_kg=9.1785e-7,  # [F]
         rotor_inflow_kg=10.311e-7,  # [F]
-        body_drag_kg_m=(0.0, 0.0, 0.0),  # [F]: all of it grows with the rotors' speed
+        body_drag_kg_m=(0.0, 0.0, 0.0),  # [F]: all drag grows with the rotors' speed
         efficiency=0.5,  # estimate for 7 minutes in the air [B]
     ),
 )

@@ -76,7 +76,7 @@ class FacePose:
     turn_rad: float = 0.0
 
     def rotation(self) -> NDArray[np.float64]:
-        """Return the world-from-face rotation, (3, 3), with columns picture's right, its up, outward normal."""
+        """Return the world-from-face rotation, (3, 3); columns: the picture's right and up, the outward normal."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         ce, se = math.cos(self.elevation_rad), math.sin(self.elevation_rad)
         right = np.array([-sy, cy, 0.0])
@@ -90,7 +90,7 @@ class FacePose:
 class Room:
     """The bounds of the world, which drones never leave.
 
-    Without ``enclosed`` there is ground and sky but no visible walls or ceiling; the bounds then act like a net.
+    If not ``enclosed``, the world has ground and sky but no visible walls or ceiling; its bounds then act like a net.
     """
 
     size_m: Vec3  # x, y, z extents
@@ -171,7 +171,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class MarkerPattern:
-    """A printed marker of ``size_m`` (edge of the black square) with a white margin of ``margin_m``."""
+    """A printed marker whose black square has edges of ``size_m``, with a white margin of ``margin_m``."""
 
     dictionary: str
     marker_id: int
@@ -186,7 +186,7 @@ class MarkerPattern:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker with a fixed pose: that of its centre. The picture's up is the marker's own."""
+    """A printed marker with a fixed pose: that of its centre. The marker's own top is the top of the picture."""
 
     name: str
     pose: FacePose
@@ -217,7 +217,7 @@ class CirclePath:
 class OvalPath:
     """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
-    It starts ``start_m`` along the track from the beginning of the southern straight; if clockwise, the northern one.
+    It starts ``start_m`` after the beginning of the southern straight, or of the northern one if clockwise.
     """
 
     centre_m: Vec3
@@ -244,7 +244,7 @@ class WalkPath:
     """A seeded random walk between points in a box, with each leg at a speed drawn from a range.
 
     The box extends from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``), so
-    that the walk can leave the box by some 0.1 m.
+    the walk can leave the box by about 0.1 m.
     """
 
     low_m: Vec3
@@ -255,7 +255,7 @@ class WalkPath:
 
 @dataclass(frozen=True, slots=True)
 class RingWalkPath:
-    """A seeded random walk around a centre within a ring, with occasional reversals. Rounded like ``WalkPath``."""
+    """A seeded random walk around a centre within a ring, with occasional reversals. Corners are rounded."""
 
     centre_m: Vec2
     radius_m: Vec2  # minimum, maximum
@@ -304,7 +304,7 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 class BoardTarget:
     """An upright card with a marker that is carried along a path. Drones pass through it.
 
-    The path is that of the card's centre, and the yaw is the heading of the card's face.
+    The path describes the card's centre, and the yaw is the heading of the card's face.
     """
 
     name: str
@@ -317,7 +317,7 @@ class BoardTarget:
 class PlatformTarget:
     """A solid slab with a marker on its top, moving along a path. Drones can land on it.
 
-    The path is that of the top face's centre, and the marker's up is the platform's heading.
+    The path describes the top face's centre, and the top of the marker points along the platform's heading.
     """
 
     name: str
@@ -335,7 +335,7 @@ FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.
 class FigureTarget:
     """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
-    The path is that of the middle of its footprint (z is the ground below), and the yaw is its heading.
+    The path describes the middle of its footprint (z is the ground below it), and the yaw is its heading.
     """
 
     name: str
@@ -343,7 +343,7 @@ class FigureTarget:
     path: Path
     yaw: Yaw
     size_m: Vec3  #: size along the figure's own x (ahead), y (left) and z
-    #: number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes
+    #: index that selects the colours and the pattern of the clothes; figures of the same shape and look are look-alikes
     look: int = 0
     colour: Rgb | None = None  #: colour of a person's top or a car's body; None for the look's colour
 
@@ -371,7 +371,7 @@ class TargetState:
     def face(self, target: Target) -> FacePose:
         """Return the pose of the target's marker at this time."""
         if isinstance(target, PlatformTarget):
-            # Facing up, with the picture's up along the heading; FacePose explains the half turn.
+            # The picture faces up, with its top along the heading; FacePose explains the half turn.
             return FacePose(self.position_m, yaw_rad=self.yaw_rad + math.pi, elevation_rad=math.pi / 2)
         return FacePose(self.position_m, yaw_rad=self.yaw_rad)
 
@@ -393,7 +393,7 @@ class Wind:
 class Light:
     """Slowly changing daylight, as under passing clouds: between 1 - ``amplitude`` and 1 times the full brightness.
 
-    It is the sum of two sines, with ``period_s`` and about a third of it, and phases from the world's seed.
+    It sums two sines with periods of ``period_s`` and about a third of that, and phases from the world's seed.
     """
 
     amplitude: float = 0.0

@@ -1,7 +1,7 @@
-"""Worlds in TOML files: their tables with the allowed values, and reading them.
+"""Worlds in TOML files: the tables with their allowed values, and functions that read them.
 
 Lengths are in metres, speeds in metres per second and angles in **degrees** (with keys that end in ``_deg``), because
-people write these files; degrees are converted to radians only here. The files in ``worlds/`` show every table.
+people write these files by hand; degrees are converted to radians only here. The files in ``worlds/`` show every table.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ Cycles = Annotated[float, Meta(ge=0.0, le=20.0)]
 RingRadius = Annotated[float, Meta(ge=0.1)]
 RingHeight = Annotated[float, Meta(ge=0.0)]
 TurnRate = Annotated[float, Meta(ge=1.0, le=720.0)]
-#: The id of a marker; which ones are valid depends on the dictionary.
+#: The ID of a marker; the dictionary determines which IDs are valid.
 MarkerId = Annotated[Any, Meta(description="a whole number, a marker's in its dictionary")]
 
 
@@ -109,7 +109,7 @@ class WindTable(_Table, kw_only=True):
 
 
 class VariedTable(Named, kw_only=True):
-    """An object that the seed may move up to this far from its position in the file."""
+    """An object, and how far the seed may move it from its position in the file."""
 
     vary: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 0.0, 0.0)
     vary_yaw_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 0.0
@@ -133,7 +133,7 @@ class GateTable(VariedTable, kw_only=True):
 
 
 class FaceTable(Named, kw_only=True):
-    """Position on a face of the room by two coordinates, or anywhere with a heading."""
+    """Position given by two coordinates on a face of the room, or by a point and a heading."""
 
     on: Mount | None = None
     at: Spot | None = None
@@ -238,7 +238,7 @@ class PlatformTable(BoardTable, kw_only=True, tag_field="kind", tag="platform"):
 
 
 class FigureTable(Named, kw_only=True, tag_field="kind", tag="figure"):
-    """The path is on the ground below the figure, and the heading is by default that of the path."""
+    """The path is on the ground below the figure, and by default the heading follows the path."""
 
     shape: Literal["person", "car"] = "person"
     path: PathTable
@@ -276,7 +276,7 @@ class WorldTable(_Table, kw_only=True):
 
 
 _NEAREST_M = 0.01  # minimum distance between two waypoints
-_WALL_GAP_M = 0.004  # distance of posters and markers from their wall, which gives the renderer a clear order
+_WALL_GAP_M = 0.004  # distance of posters and markers from their wall, which makes the drawing order unambiguous
 
 N = TypeVar("N", bound=Named)
 T = TypeVar("T")
@@ -421,7 +421,7 @@ def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room
     """Return the pose of an object on one of the room's faces.
 
     On a wall, ``along`` is x (north, south) or y (east, west), and ``other`` is the height. On the floor and the
-    ceiling they are x and y, and the image's up points east.
+    ceiling they are x and y, and the top of the image points east.
     """
     half_x, half_y, height = room.size_m[0] / 2, room.size_m[1] / 2, room.size_m[2]
     gap = _WALL_GAP_M
@@ -497,7 +497,7 @@ def _walk(table: WalkTable, room: Room, place: Place) -> Path:
     _require_inside(place, "low", low, room)
     _require_inside(place, "high", high, room)
     if any(a > b for a, b in zip(low, high, strict=True)) or low == high:
-        raise place.error("high", f"{list(high)} must be greater than 'low' {list(low)} in some axis and less in none")
+        raise place.error("high", f"{list(high)} must be at least 'low' {list(low)} on each axis and greater on one")
     _require_order(place, "speed", table.speed)
     return WalkPath(low, high, table.speed, table.acceleration)
 
@@ -605,7 +605,7 @@ def _places(things: list[Varied], apart_m: float, random: np.random.Generator) -
 
 
 def _centre(thing: Varied) -> tuple[float, float, float] | None:
-    """Return the position given in the file; None for a box without one, which is refused later by name."""
+    """Return the position given in the file; None for a box without a position, which is refused later by name."""
     if isinstance(thing, BoxTable) and thing.stands_at is not None:
         return (*thing.stands_at, 0.0)
     return thing.position

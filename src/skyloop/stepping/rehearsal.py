@@ -71,7 +71,7 @@ class Radio:
 def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
     """Connect as a pilot to a drone in a simulated world.
 
-    Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, not in real time.
+    Only the thread that runs the ``with`` block may wait. Frames are rendered when they are exposed, not in real time.
 
     Args:
         uri: A ``sim://`` address without ``speed``.
@@ -112,14 +112,14 @@ class _RehearsalDriver(SimDriver):
         self._radio = radio
         self._clock = clock
         self._random = random.Random(f"rehearsal/{radio.seed}")
-        # A separate generator, so that cameras don't change the losses of commands and feedback.
+        # Cameras use a separate generator, so that they don't change which commands and feedback are lost.
         self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
         self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap ordered by arrival time
         self._numbers = itertools.count()
 
     @property
     def due_ns(self) -> int | None:
-        """When the next step or arrival is due."""
+        """Time at which the next step or arrival is due."""
         assert isinstance(self.host, SteppedHost)
         step_ns = self.host.due_ns
         if step_ns is None or not self._on_the_way:
@@ -196,7 +196,7 @@ class SteppedHost(SimHost):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next step is due on the clock; None without an observer."""
+        """Time on the clock at which the next step is due; None if there is no observer."""
         return None if self._manual_stepper is None else self._manual_stepper.due_ns
 
     def step(self) -> None:

@@ -1,7 +1,7 @@
 """A replay in step with its application: ``skyloop.connect("replay://flight.mcap?speed=max")``.
 
 Proxy, recording and application share this process, with a clock that stops while the application's code runs. Whenever
-the application waits for the next frame, for a state or in :meth:`Controller.run`, the clock advances to the next
+the application waits for a frame, for a state or in :meth:`Controller.run`, the clock advances to the next
 event: a recorded sample, a repeated command or a proxy tick. Each sample is therefore consumed before the next one
 exists, the application sees the recording's times, and two runs of the same controller produce the same commands.
 """
@@ -18,7 +18,7 @@ from skyloop.stepping.transport import StepExecutor, SteppedServer, StepSchedule
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
-LEAD_NS: Final = NS_PER_S  #: how long before the recording's start the clock begins: a few ticks in which to connect
+LEAD_NS: Final = NS_PER_S  #: time between the clock's start and the recording's: leaves a few ticks to connect
 
 
 def connector(uri: str) -> SteppedReplay | None:
@@ -27,8 +27,8 @@ def connector(uri: str) -> SteppedReplay | None:
     Args:
         uri: The address, ``replay://…``.
 
-    Returns:
-        The replay if the address says ``speed=max``; otherwise None, because a private proxy serves such addresses.
+    Returns: The replay if the address contains ``speed=max``; otherwise None, because a private proxy serves such
+        addresses.
 
     Raises:
         UsageError: The address or the recording is invalid.

@@ -58,7 +58,7 @@ class StepExecutor:
     def call(self, job: Job, interrupt: Job) -> None:
         """Queue a job and wait until it has returned; its exceptions are raised here.
 
-        After Ctrl-C ``interrupt`` is called on this thread, to make the job return.
+        If Ctrl-C is pressed, this calls ``interrupt`` on this thread to make the job return.
         """
         done = threading.Lock()
         done.acquire()
@@ -83,7 +83,7 @@ class StepExecutor:
             raise raised[0]
 
     def run_pending(self) -> None:
-        """Run all posted jobs, including those they post themselves. Call this only on the executor's thread."""
+        """Run all posted jobs, including jobs that they post. Call this only on the executor's thread."""
         while True:
             try:
                 job = self._jobs.get_nowait()
@@ -116,7 +116,7 @@ ADDRESS: Final = "this process, in step with one application"
 
 
 class SteppedServer(TransportServer):
-    """The proxy's end, which serves one client at a time. Handlers are called on the executor's thread."""
+    """The proxy's side, which serves one client at a time. Handlers are called on the executor's thread."""
 
     def __init__(self, executor: StepExecutor) -> None:
         self._executor = executor
@@ -125,7 +125,7 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect a client, whose handler runs on the executor's thread; LinkError for a second or after a stop."""
+        """Connect a client, whose handler runs on the executor's thread; LinkError if there is one, or after a stop."""
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")
@@ -190,7 +190,7 @@ class SteppedServer(TransportServer):
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection once; each end's handler is called after all earlier packets have been delivered."""
+        """End a connection unless it has ended; each side's handler is called after all earlier packets."""
         if self._client is not client:
             return
         self._client = None
@@ -205,7 +205,7 @@ class SteppedServer(TransportServer):
 
 
 class SteppedClient(TransportClient):
-    """The client's end."""
+    """The client's side of the transport."""
 
     def __init__(self, server: SteppedServer, executor: StepExecutor, peer: Peer, handler: ClientHandler) -> None:
         self.peer = peer
@@ -257,7 +257,7 @@ class SteppedClient(TransportClient):
             self._handler.frame(header, pixels)
 
     def ended(self, reason: str) -> None:
-        """Tell the handler once that the connection has ended."""
+        """Notify the handler, once, that the connection has ended."""
         self._handler.closed(reason)
         self._closed.set()
 
@@ -272,7 +272,7 @@ class StepSource(Protocol):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next event is due; None after the last one."""
+        """Time at which the next event is due; None after the last one."""
 
     def step(self) -> None:
         """Publish the sample or run the step that is due now."""
@@ -291,7 +291,7 @@ class StepScheduler(Scheduler):
         source: Callable[[], StepSource | None],
         begin_ns: int,
     ) -> None:
-        """Set up simulated time; ``source`` returns the source of samples or steps, None before it exists."""
+        """Set up simulated time; ``source`` returns the source of samples or steps, or None if there is none yet."""
         super().__init__(clock)
         self._time = clock
         self._executor = executor

@@ -1,6 +1,6 @@
 """Computer vision: detection of markers, gates, colours and objects, tracking, optical flow, lenses and calibration.
 
-Needs the extra ``vision``, and ``detect`` for detectors. OpenCV and ONNX Runtime are imported on first use.
+Requires the extra ``vision``, and ``detect`` for detectors. OpenCV and ONNX Runtime are imported on first use.
 """
 
 from skyloop.vision.appearance import LongTermTracker

@@ -32,42 +32,42 @@ from skyloop.vision.tracking import (
     patch,
 )
 
-_VERIFIED: Final = 0.45  # a tracked box counts as verified from this similarity to the memory
-_SURE: Final = 0.6  # the appearance is learned from this similarity
-_FOUND: Final = 0.55  # a lost target is tried at places of at least this similarity
+_VERIFIED: Final = 0.45  # minimum similarity to the memory for a tracked box to count as verified
+_SURE: Final = 0.6  # minimum similarity for the appearance to be learned
+_FOUND: Final = 0.55  # minimum similarity for a place to be tried when the target is lost
 _UNLIKE_OTHERS: Final = 0.15  # required lead in similarity over all other places and known look-alikes
-_LOOK_ALIKE: Final = 0.4  # anything near the target with this similarity is remembered as a look-alike
+_LOOK_ALIKE: Final = 0.4  # minimum similarity for anything near the target to be remembered as a look-alike
 _PATIENCE: Final = 10  # number of images without verification before the whole image is searched
 _TRIAL: Final = 3  # number of images in which a found place must be verified
 _LEARN_EACH: Final = 5  # minimum number of images between updates of the memory
 _LOOK_AROUND_EACH: Final = 15  # number of images between searches for look-alikes
 _SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # multiples of the target's last size, one searched per image
 
-# Score, and fraction of such boxes that overlap the target by at least half: `python -m benchmarks.tracking_street`.
+# Score, and the fraction of boxes that overlap the target by half or more (`python -m benchmarks.tracking_street`).
 _CONFIDENCE: Final = ((0.45, 0.857), (0.55, 0.946), (0.65, 0.974), (0.75, 0.986), (0.85, 0.986), (0.95, 0.989))
 _PLACES: Final = 5  # number of strips across a box in which its colours are sampled
 _ASIDE: Final = 0.12  # offset between neighbouring strips, as a fraction of the box's width
-_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as fractions of the height
+_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half: ranges from the top, as fractions of the height
 _SIZE: Final = (24, 24)  # size of the stored patch, whatever the target's shape [px]
 _GRADIENTS: Final = 7  # number of gradient channels, which come first in the features
-_COLOUR_WEIGHT: Final = 1.2  # decay of the similarity with the colour distance
+_COLOUR_WEIGHT: Final = 1.2  # rate at which the similarity decays with the colour distance
 _KEPT: Final = 12  # maximum number of appearances, and of look-alikes
 _NEW_BELOW: Final = 0.9  # appearances more similar to a known one than this are not added
 _SEARCHED_PX: Final = 16.0  # side of the target in the shrunk search image
-_LEAST_MATCH: Final = 0.35  # correlation from which a place is examined
-_WORTH_NUDGING: Final = 0.2  # refine places from this similarity; a match exceeds it even a fifth of the size off
+_LEAST_MATCH: Final = 0.35  # minimum correlation for a place to be examined
+_WORTH_NUDGING: Final = 0.2  # minimum similarity for refining a place; a match reaches it even 20 % off in size
 _NUDGE: Final = 0.08  # step of the refinement, as a fraction of the target's size
 _GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:
-    """Return the estimated chance, 0 to 1, that a box with this score overlaps the target by half or more; monotone."""
+    """Return the estimated probability that a box with this score overlaps the target by half or more; monotone."""
     return float(np.interp(score, [at for at, _ in _CONFIDENCE], [share for _, share in _CONFIDENCE]))
 
 
 class _State(Enum):
     TRACKING = "tracking"
-    ON_TRIAL = "on trial"  # found again, not yet trusted
+    ON_TRIAL = "on trial"  # target found again but not yet trusted
     LOST = "lost"
 
 
@@ -81,7 +81,7 @@ class LongTermTracker(Tracker):
     three images.
 
     A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
-    new box. The score is the similarity to the closest appearance; its confidence is calibrated on simulated figures.
+    new box. The score is the similarity to the closest appearance; ``confidence`` is calibrated on simulated people.
     """
 
     def __init__(self, tracker: Callable[[], Tracker] = CorrelationTracker) -> None:
@@ -170,7 +170,7 @@ class LongTermTracker(Tracker):
         return TrackResult(seen.box, seen.similarity, confidence(seen.similarity))
 
     def _doubt(self, seen: Candidate | None) -> TrackResult:
-        """Keep an unverified target for a while, but drop a clear look-alike or a target on trial at once."""
+        """Keep an unverified target for a while, but immediately drop one that is on trial or clearly a look-alike."""
         self._count += 1
         mistaken = seen is not None and _is_other(seen)
         if self._state is _State.ON_TRIAL or mistaken or self._count >= _PATIENCE:
@@ -202,7 +202,7 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Return whether a place clearly shows a look-alike. Only tracking can tell an exact twin apart."""
+    """Return whether a place clearly contains a look-alike. Only tracking can tell an exact twin apart."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 
@@ -234,8 +234,8 @@ class Appearance:
 def colours(image: Image, box: Box) -> Floats:
     """Return the colours of a box's upper and lower half, (5, 6) float32: L, a, b of each (CIELAB).
 
-    One row for each of five strips, each a third of the box's width, from left to right: a person with an arm or a leg
-    stretched out is not in the middle of the box, which then shows the background. The image is BGR or grey.
+    There is one row for each of five strips from left to right, each a third of the box's width: the middle of the box
+    shows only background if a person has an arm or a leg stretched out. The image is BGR or grey.
     """
     cv = opencv("comparing colours")
     x, y, width, height = box
@@ -259,7 +259,7 @@ def _within(low: float, high: float, most: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place in an image that may be the target."""
+    """A place in an image where the target may be."""
 
     box: Box
     similarity: float  #: similarity to the closest appearance of the target
@@ -280,7 +280,7 @@ class TargetMemory:
         self._turn = 0
 
     def judged(self, image: Image, box: Box) -> Candidate:
-        """Compare a box's content with everything in the memory."""
+        """Compare a box's content with all remembered appearances."""
         seen = Appearance.of(self._cv, image, box)
         return Candidate(box, _nearest(seen, self._appearances), _nearest(seen, self._look_alikes))
 
@@ -295,7 +295,7 @@ class TargetMemory:
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
         """Search the whole image for the target [px], using another of its appearances each time.
 
-        Return at most the three best places, the most similar first, without those that overlap ``besides`` by over a
+        Return up to three of the best places, most similar first, without those that overlap ``besides`` by more than a
         tenth.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
@@ -313,7 +313,7 @@ class TargetMemory:
         found = []
         for _ in range(3):
             _, best, _, (x, y) = cv.minMaxLoc(match)
-            if not best >= _LEAST_MATCH:  # NaN in a part without texture
+            if not best >= _LEAST_MATCH:  # NaN where the image has no texture
                 break
             box = (x / wide, y / high, float(size[0]), float(size[1]))
             if besides is None or overlap(box, besides) < 0.1:
@@ -323,7 +323,7 @@ class TargetMemory:
         return sorted(found, key=lambda one: -one.similarity)
 
     def _nudged(self, image: Image, box: Box) -> Candidate:
-        """Refine the coarse search by returning the most similar of the nearby boxes, unless the place is hopeless."""
+        """Refine the coarse search: return the most similar of the nearby boxes, unless the place is hopeless."""
         rough = self.judged(image, box)
         if rough.similarity < _WORTH_NUDGING:
             return rough

@@ -34,7 +34,7 @@ Model = Literal["pinhole", "fisheye"]
 
 LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
 GRID: Final = (8, 6)  #: number of cells across and down for measuring coverage
-_WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
+_WORST_SHARE: Final = 2.5  # views whose error exceeds this many times the median are removed ...
 _WORST_PX: Final = 0.3  # ... and above this
 _NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
@@ -130,7 +130,7 @@ class Board:
             raise UsageError(
                 f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, and must be 20 to 2000"
             )
-        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # at which a square has exactly its size
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # resolution at which squares are exactly to size
         with replacing(file) as part:
             if file.suffix.lower() == ".pdf":
                 Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)
@@ -336,8 +336,8 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # Without k3: estimated from few images it is mostly noise, and it bends the image's corners, where there was no
-    # data. Lenses that need it are fisheyes.
+    # k3 is left out: estimated from few images, it is mostly noise and bends the image's corners, where there was no
+    # data. Lenses that need k3 are fisheye lenses.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )
@@ -360,7 +360,7 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """Return a fisheye flag. OpenCV 4 has separate ones with different values, OpenCV 5 has one set for all."""
+    """Return a fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 

@@ -2,9 +2,9 @@
 
 Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from frame to frame by pyramidal
 Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forward and back.
-Each ray is levelled by the attitude and intersected with the ground at the measured height. A corner first seen from a
-known position gives the vehicle's current one, and the result is the median over all corners. The position drifts only
-as corners leave the image and new ones replace them.
+Each ray is levelled by the attitude and intersected with the ground at the measured height. A corner that was first
+seen from a known position yields the vehicle's current position; the result is the median over all corners. The
+position drifts only as corners leave the image and new ones replace them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skyloop.vision.opencv import opencv
 
 _MOST: Final = 80  # maximum number of tracked corners
 _ENOUGH: Final = 8  # minimum number of corners for a position
-_REFILL: Final = 50  # number of corners below which new ones are detected
+_REFILL: Final = 50  # minimum number of corners; if there are fewer, new ones are detected
 _APART_PX: Final = 12  # minimum distance between corners
 _RETURN_PX: Final = 0.7  # maximum distance between a corner and where it returns after tracking forward and back
 _LOWEST_M: Final = 0.15  # minimum height; any closer to the ground, the image has no corners to track
@@ -85,7 +85,7 @@ class GroundTracker:
             self.forget()
             return None
         if self._grey is not None and self._grey.shape != grey.shape:
-            self.forget()  # the image size changed: the corners are elsewhere
+            self.forget()  # the image size changed, so the corners are no longer there
         began = self._grey is None
         self._track(grey)
         below, good = self._below(self._corners, at_capture, intrinsics)

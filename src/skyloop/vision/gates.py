@@ -25,7 +25,7 @@ Rgb = tuple[int, int, int]
 
 _HUE_DEG: Final = 16.0  # tolerance on either side of the colour's hue
 _SATURATION: Final = 0.5  # minimum saturation as a fraction of the colour's own; covers paint in light and shade
-_LEAST_SATURATION: Final = 80  # 0 to 255: a less saturated colour is too grey to distinguish
+_LEAST_SATURATION: Final = 80  # 0 to 255: less saturated colours are too grey to distinguish
 _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance
 _FARTHEST_M: Final = 8.0  # maximum distance; anything further away is more likely a patch of the same colour
@@ -36,7 +36,7 @@ _LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
 _SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
 _ABOVE_PX: Final = 6  # height of the area above a pole that is searched for something hiding its top
 _COLOURFUL: Final = 100  # saturation from which a pixel counts as colourful, 0 to 255
-_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece, unlike two overlapping poles
+_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece; overlapping poles have fewer
 
 
 class ColourMask:
@@ -69,11 +69,11 @@ class BlobSighting:
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: angle of the left edge from the optical axis, positive to the left
-    right_rad: float  #: angle of the right edge, with the same sign: less than `left_rad`
+    right_rad: float  #: angle of the right edge with the same sign convention, smaller than `left_rad`
 
     @property
     def bearing_rad(self) -> float:
-        """Angle of the object's middle from the optical axis, positive to the left."""
+        """Angle of the object's centre from the optical axis, positive to the left."""
         return (self.left_rad + self.right_rad) / 2
 
     @property
@@ -96,7 +96,7 @@ class BlobDetector:
 
         Args:
             colour: Red, green, blue, 0 to 255.
-            least_px: Ignore areas narrower or lower than this [px].
+            least_px: Ignore areas narrower or shorter than this [px].
 
         Raises:
             UsageError: The colour is invalid, or too grey to have a hue.
@@ -193,7 +193,7 @@ class GateDetector:
         ]
 
     def _sighting(self, edge: Array, intrinsics: Intrinsics) -> GateSighting | None:
-        """Return the opening that a hole's edge bounds; None if the hole is not an opening."""
+        """Return the opening bounded by a hole's edge; None if the hole is not an opening."""
         rough = self._four_corners(edge)
         if rough is None:
             return None
@@ -310,7 +310,7 @@ class PoleDetector:
         for label, (x, y, width, height, area) in enumerate(boxes[:count].tolist()):
             if label == 0 or height < _LEAST_HEIGHT_PX or area * _SLIM > height * height:
                 continue
-            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # cut off at the side or the top
+            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # the pole is cut off at the side or the top
                 continue
             line = _line(labels[y : y + height, x : x + width] == label)
             if line is None:
@@ -332,7 +332,7 @@ class PoleDetector:
 
 
 def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Return the top of a leaning pole, measured from the left, and its width; None if it is not in one piece."""
+    """Return the horizontal position of a leaning pole's top and its width; None if the pole is not in one piece."""
     rows = np.arange(len(shape))
     first, last = shape.argmax(axis=1), shape.shape[1] - 1 - shape[:, ::-1].argmax(axis=1)
     whole = shape.any(axis=1) & (shape.sum(axis=1) == last - first + 1)

@@ -18,8 +18,8 @@ from skyloop.messages import Intrinsics
 from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
-_WIDEST = 1e-9  # z divided by distance: at smaller values a point is beside or behind the camera
-_STEEPEST = 3.0  # x/z, 72°: an even wider ideal camera would show little but its edges
+_WIDEST = 1e-9  # z divided by distance: a point with a smaller value is not in front of the camera
+_STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little besides its edges
 _DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which the distortion is sampled
 _RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it back
 _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversion
@@ -31,7 +31,7 @@ def checked(
     """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
 
     It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
-    wrong shape or type, an empty array, or without intrinsics.
+    wrong shape or type, an empty array, or missing intrinsics.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -60,7 +60,7 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
         intrinsics: Intrinsics of the camera.
 
     Returns:
-            Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole camera or beyond
+            Pixels (n, 2); NaN for points that the model can't show: not in front of a pinhole camera or beyond
             the angle at which the lens polynomial turns back.
 
     Raises:
@@ -102,7 +102,7 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z (n, 2) of the directions of pixels (n, 2); NaN also for those beside or behind the camera."""
+    """Return x/z and y/z (n, 2) of the directions of pixels (n, 2); NaN if not in front of the camera."""
     if not _is_fisheye(intrinsics):
         return _ideal(_rows(pixels, 2), intrinsics)
     rays = unproject(pixels, intrinsics)
@@ -150,9 +150,9 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Return the ideal pinhole's focal length, between showing only valid pixels and showing the whole view."""
+    """Return the ideal pinhole's focal length; ``balance`` 0 shows only valid pixels, 1 shows the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
-    reach = []  # distance between each side and the axis, with the least and greatest direction on that side
+    reach = []  # for each side: distance from the axis in pixels, divided by its least and by its greatest direction
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
         side = np.full((len(along), 2), at)
         side[:, 1 - axis] = along
@@ -175,7 +175,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
     else:
         flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
     found = np.asarray(flat, dtype=np.float64).reshape(-1, 2)
-    # Beyond a lens's fold the iteration can end anywhere, so reject results that don't project back.
+    # Beyond a lens's fold the iteration may converge to any point, so reject results that don't project back.
     back = project(np.column_stack([found, np.ones(len(found))]), intrinsics)
     found[~(np.abs(back - pixels).max(axis=1) < _RETURN_PX)] = np.nan
     return found

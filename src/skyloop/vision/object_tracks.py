@@ -1,9 +1,9 @@
-"""Detections, in the form common to all detectors, and objects: detections matched from image to image. Pure.
+"""Detections, in a format common to all detectors, and objects, which are detections matched across images. Pure.
 
 Detections are joined into objects with permanent numbers as in Zhang et al., "ByteTrack: Multi-Object Tracking by
 Associating Every Detection Box", ECCV 2022: confident detections are matched with all objects first, then uncertain
-ones with the remaining objects, because half-hidden things get low scores. Only confident ones start an object. Each
-object's box has a constant-velocity Kalman filter, which uses real times here instead of image counts, so that a
+ones with the remaining objects, because half-hidden things get low scores. Only confident detections start new objects.
+Each object's box has a constant-velocity Kalman filter, which uses real times here instead of image counts, so that a
 missed frame does no harm. The pairs come from SciPy's ``linear_sum_assignment``.
 """
 
@@ -75,8 +75,7 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
     """Keep the best of several overlapping boxes (left, top, right, bottom), class by class: non-maximum suppression.
 
-    Return the numbers of the rows kept, the best first. Boxes of a class that overlap by more than ``iou`` count as
-    one.
+    Return the indices of the rows to keep, best first. Boxes of a class that overlap by more than ``iou`` count as one.
     """
     left = np.argsort(-scores, kind="stable")
     kept: list[int] = []
@@ -94,7 +93,7 @@ class TrackedObject:
 
     id: int  #: number of the object, from 1; never reused
     detection: Detection  #: the last detection, including its box
-    box: Box  #: x, y, width, height [px], filtered, and predicted while the object is not seen
+    box: Box  #: x, y, width, height [px], filtered; predicted while the object is not detected
     velocity: tuple[float, float]  #: velocity of the box's centre to the right and down [px/s]
     seen: bool  #: whether the object was detected in this image
     age_s: float  #: time since the first detection [s]
@@ -106,7 +105,7 @@ class _Object:
     number: int
     detection: Detection
     state: Floats  # (2, 4): position and velocity of the centre's x and y, the width and the height
-    covariance: Floats  # (2, 2), for each of the four
+    covariance: Floats  # covariance of position and velocity for each of the four, (2, 2)
     first_s: float
     last_s: float
     hits: int = 1
@@ -128,8 +127,8 @@ class ObjectTracks:
         """Start with no objects.
 
         Args:
-            sure: Score from which a detection can start an object, 0 to 1. Have the detector return lower scores too
-                (``OnnxDetector(…, score=0.1)``), because they continue objects.
+            sure: Minimum score, 0 to 1, for a detection to start a new object. Have the detector return lower scores
+                too (``OnnxDetector(…, score=0.1)``): they keep existing objects alive.
             overlap: Minimum overlap of an object's predicted box with a confident detection, 0 to 1.
             overlap_unsure: Minimum overlap with an uncertain detection, 0 to 1.
             confirm: Number of detections after which an object is returned; 1 or more.
@@ -246,7 +245,7 @@ def _correct(each: _Object, detection: Detection, time_s: float) -> None:
 
 
 def _place(each: _Object) -> None:
-    each.state[0, 2:] = np.maximum(each.state[0, 2:], 1.0)  # a shrinking box must not vanish
+    each.state[0, 2:] = np.maximum(each.state[0, 2:], 1.0)  # keeps a shrinking box from vanishing
     centre, size = each.state[0, :2], each.state[0, 2:]
     each.corners = np.concatenate([centre - size / 2, centre + size / 2])
 

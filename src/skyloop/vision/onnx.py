@@ -56,7 +56,7 @@ def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
 def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    One or two files make a tracker of OpenCV, by its name; without a name the file is loaded in ONNX Runtime.
+    A tracker of OpenCV takes one or two files and a name; without a name ONNX Runtime loads the file.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
@@ -77,7 +77,7 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
 
 
 def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
-    """Load a network and run it on zeros within limits. This is the main function of the child process."""
+    """Load a network and run it on zeros within limits. This runs as the main function of the child process."""
     if sys.platform != "win32":
         import resource
 
@@ -88,7 +88,7 @@ def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
             resource.setrlimit(kind, (limit, limit))
     try:
         run = _tracker(tracker, files) if tracker else _network(files[0])
-    except Exception as error:  # noqa: BLE001  the parent raises it again
+    except Exception as error:  # noqa: BLE001 raised again in the parent
         print(reason(error))
         sys.exit(_REFUSED)
     try:

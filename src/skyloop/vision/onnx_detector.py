@@ -36,21 +36,21 @@ class Layout(StrEnum):
     YOLO8 = "yolo8"  #: (1, 4 + classes, n), pixels: YOLOv8, v9, v11
     END_TO_END = "end-to-end"  #: (1, n, 6) left, top, right, bottom, score, class: YOLOv10, exports with suppression
     YOLOX = "yolox"  #: (1, n, 5 + classes), offsets on a grid; the input is BGR of 0 to 255
-    YOLOX_DECODED = "yolox-decoded"  #: as YOLOX, but in pixels
+    YOLOX_DECODED = "yolox-decoded"  #: like YOLOX, but in pixels
     RT_DETR = "rt-detr"  #: (1, n, 4 + classes), fractions of the image
     DETR = "detr"  #: boxes (1, n, 4), fractions of the image, and logits or scores (1, n, classes)
-    RF_DETR = "rf-detr"  #: as DETR, but the input is normalised by ImageNet's mean and deviation
+    RF_DETR = "rf-detr"  #: like DETR, but the input is normalised by ImageNet's mean and deviation
     LISTS = "lists"  #: boxes (n, 4) in pixels, scores (n) and labels (n): torchvision, RT-DETR with its postprocessor
 
 
-#: Layouts that take the whole image stretched instead of letterboxed.
+#: Layouts for which the whole image is stretched instead of letterboxed.
 STRETCHED: Final = frozenset({Layout.RT_DETR, Layout.DETR, Layout.RF_DETR})
 #: Layouts that take BGR from 0 to 255 instead of RGB from 0 to 1.
 RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
 #: Layouts whose boxes overlap and need suppression.
 SUPPRESSED: Final = frozenset({Layout.YOLO5, Layout.YOLO8, Layout.YOLOX, Layout.YOLOX_DECODED})
 
-_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # grids of YOLOX models [px]
+_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # strides of the grids of YOLOX models [px]
 _FEW: Final = 1000  # maximum number of queries of a network without suppression (usual: 100 to 900, mostly 300)
 
 Array = NDArray[np.generic]
@@ -77,9 +77,9 @@ def describe(outputs: Outputs) -> str:
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Recognise a network's layout from its outputs by name, from one run on any image; width and height of its input.
+    """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
 
-    FileFormatError if they fit none of the families, or several. ``classes`` is the number of known class names.
+    FileFormatError if they fit none of the families, or more than one. ``classes`` is the number of known class names.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -180,7 +180,7 @@ def _unknown(outputs: Outputs) -> FileFormatError:
 
 
 def _single(outputs: Outputs, layout: Layout) -> Array:
-    """Return the only output for one image; if the first one fits, ignore others (of a training head)."""
+    """Return the only output for one image; ignore further outputs (of a training head) if the first one fits."""
     values = next(iter(outputs.values()), None)
     if values is None or values.ndim != 3 or values.shape[0] != 1:
         raise FileFormatError(
@@ -205,7 +205,7 @@ def _numbers(values: Array) -> Floats:
 
 
 def _pair(outputs: Outputs) -> tuple[Array, Array]:
-    """Tell boxes from logits, by name if both could be boxes."""
+    """Distinguish boxes from logits, by name if both could be boxes."""
     shapes = [value.shape for value in outputs.values()]
     if len(shapes) != 2 or any(len(s) != 3 or s[0] != 1 for s in shapes) or shapes[0][1] != shapes[1][1]:
         raise _unknown(outputs)
@@ -258,7 +258,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's best class. NaN counts as the best, so that its row is dropped later."""
+    """Take each row's best class. NaN counts as the best score, so that its row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)
@@ -311,12 +311,12 @@ def layout_named(name: str | Layout | None) -> Layout | None:
         raise UsageError(f"layout is {name!r} and must be one of {known}") from None
 
 
-_GREY: Final = 114  # padding of letterboxed images, as YOLO networks are trained with
+_GREY: Final = 114  # grey level of the padding of letterboxed images, the same as in YOLO's training
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's mean, for RF-DETR
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
 _SIDE: Final = 640  # default side for a network that takes any size
 _MOST_SIDE: Final = 4096  # maximum side of an input image [px]
-_MOST: Final = 1000  # number of best boxes to compare with one another
+_MOST: Final = 1000  # maximum number of best boxes that are compared with each other
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
@@ -327,7 +327,7 @@ class OnnxDetector:
         layout: Layout of the network's outputs.
         names: Class names by number.
         size: Width and height of the network's input [px].
-        dropped: Number of detections dropped for values that were not finite or a score outside 0 to 1.
+        dropped: Number of detections dropped because a value was not finite or the score was not from 0 to 1.
     """
 
     def __init__(
@@ -407,7 +407,7 @@ class OnnxDetector:
         return self._detections(found, scale, shift, (pixels.shape[1], pixels.shape[0]))
 
     def _fit(self, pixels: Image) -> tuple[Image, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the image fitted to the input size, its scale and its corner, the last two as x and y."""
+        """Return the image fitted to the input size, its scale (x, y) and the position of its corner (x, y)."""
         width, height = self.size
         rows, columns = pixels.shape[:2]
         if self.layout in STRETCHED:
@@ -433,7 +433,7 @@ class OnnxDetector:
         tensor = np.ascontiguousarray(values[None], self._type)
         feed: dict[str, Any] = {self._input: tensor}
         for other in self._session.get_inputs():
-            if other.name != self._input:  # RT-DETR with its postprocessor takes the image size for its boxes
+            if other.name != self._input:  # RT-DETR's postprocessor needs the image size to scale its boxes
                 feed[other.name] = np.array([self.size], np.int64)
         try:
             results = self._session.run(None, feed)
@@ -473,7 +473,7 @@ class OnnxDetector:
         extra = [each.name for each in inputs[1:] if each.name != "orig_target_sizes"]
         shown = ", ".join(f"{each.name} {each.type} {tuple(each.shape)}" for each in inputs) or "none"
         if not inputs or extra:
-            raise FileFormatError(f"{self._path} has the inputs {shown} and must have one, an image")
+            raise FileFormatError(f"{self._path} has the inputs {shown} and must have exactly one, an image")
         first = inputs[0]
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
@@ -481,7 +481,7 @@ class OnnxDetector:
                 f"{self._path} has the input {shown} and must have (1, 3, height, width) of float, float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
-            raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for one")
+            raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for batches of 1")
         fixed = [each if isinstance(each, int) and each > 0 else None for each in (shape[3], shape[2])]
         if size is None:
             asked = _literal(metadata.get("imgsz"))

@@ -8,7 +8,7 @@ from skyloop.errors import MissingExtraError, UnknownNameError
 
 
 def opencv(what: str) -> Any:
-    """Import OpenCV, which is needed for ``what``: a noun phrase for the error message."""
+    """Import OpenCV; ``what``, a noun phrase for the error message, names the feature that needs it."""
     try:
         import cv2
     except ImportError as error:

@@ -90,8 +90,8 @@ class PlanarPose:
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
         """Estimate the pose from the four corners; None if no pose in front of the camera fits them.
 
-        The outline is in the object's own axes, (4, 3); rays are x/z and y/z of each corner; the method is an IPPE of
-        OpenCV.
+        ``outline_m`` uses the object's own axes, (4, 3); ``rays`` are x/z and y/z of each corner; ``method`` is one of
+        OpenCV's IPPE variants.
         """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
@@ -117,13 +117,13 @@ _FAMILIES: Final = (
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between attempts (some 2 ms each at 320×240), which end once a marker is found
+_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), which end once a marker is found
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerSighting(PlanarSighting):
-    """One marker in one image. Its top left is the printed marker's own."""
+    """One marker in one image. Its top-left corner matches that of the printed marker."""
 
     id: int
 
@@ -204,12 +204,12 @@ class MarkerDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
-        """Search for markers of another family, a different one each time."""
+        """Search for markers of another family, choosing a different family each time."""
         known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
         parameters = self._cv.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0  # a square object in the room must not pass for a tag
+        parameters.errorCorrectionRate = 0.0  # keeps a square object in the room from being taken for a tag
         markers = marker_dictionary(self._cv, family)
         _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
         self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
@@ -238,7 +238,7 @@ def _make_detector(cv: Any, dictionary: str) -> Any:
     parameters = cv.aruco.DetectorParameters()
     # Refine corners to a fraction of a pixel, because a marker's range is only as accurate as its edges.
     parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
-    # Half a cell each way: corners are 0.31 px off (median of 150 noisy poses), with OpenCV's 0.3 they are 0.46 px off.
+    # Half a cell each way puts corners 0.31 px off (median of 150 noisy poses); OpenCV's 0.3 puts them 0.46 px off.
     parameters.relativeCornerRefinmentWinSize = 0.5
     # The white card's edge is another square near the marker's; with OpenCV's 0.125 it can hide the marker.
     parameters.minMarkerDistanceRate = 0.05

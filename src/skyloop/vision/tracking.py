@@ -1,11 +1,11 @@
 """Trackers that follow a box from image to image by a correlation filter, by the flow of points, or by a network.
 
-**Correlation.** A filter is learned whose correlation with the patch around the target has a narrow peak at the middle
-of the patch. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using
-adaptive correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the
-target (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37,
-2015; its linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan,
-Häger, Khan and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
+**Correlation.** The tracker learns a filter whose correlation with the patch around the target peaks sharply in its
+middle. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
+correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
+(Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
+linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan, Häger, Khan
+and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
 2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half of the points that
@@ -53,7 +53,7 @@ class TrackResult:
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
     score: float  #: similarity to the target, 0 to 1; a score, not a probability
-    confidence: float | None = None  #: chance that the overlap is at least half; None without an estimate
+    confidence: float | None = None  #: probability that the overlap is at least half; None without an estimate
 
     @property
     def lost(self) -> bool:
@@ -95,7 +95,7 @@ class Tracker(ABC):
         """
         pixels = pixels_of(image)
         checked = checked_box(box, pixels.shape)
-        self._shape = None  # in case _start fails
+        self._shape = None  # remains None if _start fails
         self._start(pixels, checked)
         self._shape = pixels.shape
 
@@ -118,7 +118,7 @@ class Tracker(ABC):
             )
         return self._update(pixels)
 
-    def shift(self, right: float, down: float) -> None:  # noqa: B027 - to ignore it is allowed
+    def shift(self, right: float, down: float) -> None:  # noqa: B027 - subclasses may ignore this
         """Report how far the camera's rotation has moved the target in the image since the last one [px].
 
         The tracker looks for the target there in the next image. Trackers that search everywhere or measure the image's
@@ -127,7 +127,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def _start(self, image: Image, box: Box) -> None:
-        """Start with a checked image and box."""
+        """Start tracking in a checked image, with a checked box."""
 
     @abstractmethod
     def _update(self, image: Image) -> TrackResult:
@@ -171,7 +171,7 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box, at least partly in the image, at a size of width and height. Pixels outside repeat the edge."""
+    """Sample a box, at least partly in the image, to a size (width, height). Pixels outside repeat the edge."""
     x, y, width, height = box
     rows, columns = image.shape[:2]
     left, top = max(0, math.floor(x) - 1), max(0, math.floor(y) - 1)
@@ -229,11 +229,11 @@ _AREA_PX: Final = 128.0**2  # area of the sampled patch around the target
 _CONTEXT: Final = 1.5  # margin added to width and height, as a multiple of the square root of the target's area
 _RATE: Final = 0.02  # learning rate per image
 _SCALE_RATE: Final = 0.02  # learning rate of the size filter per image
-_REGULARISATION: Final = 0.02  # as a fraction of the spectrum's mean energy
+_REGULARISATION: Final = 0.02  # regularisation as a fraction of the spectrum's mean energy
 _SPREAD: Final = 0.08  # width of the peak as a fraction of the target's size
 _SCALES: Final = 17  # number of sizes tried per image
 _SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
-_SCALE_SPREAD: Final = 1.0  # width of the size filter's peak, in steps of the size
+_SCALE_SPREAD: Final = 1.0  # width of the size filter's peak, in size steps
 _SCALE_AREA_PX: Final = 32.0**2  # area of the sampled patch for each size
 _SMALLEST: Final = 0.2  # smallest size, as a multiple of the initial one
 _LARGEST: Final = 6.0  # largest size, as a multiple of the initial one
@@ -243,9 +243,9 @@ _WINDOW: Final = (11, 11)  # window of Lucas-Kanade [px]
 _LEVELS: Final = 3  # number of levels of its image pyramid
 _AROUND: Final = (9, 9)  # size of a point's surroundings to compare [px]
 _ENOUGH: Final = 6  # minimum number of points
-_RETURN_PX: Final = 5.0  # maximum median return distance; a larger one is a failure
+_RETURN_PX: Final = 5.0  # maximum median distance after tracking back; tracking fails above it
 _SPREAD_PX: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
-_SMALLEST_PX: Final = 6.0  # minimum side of the box; a smaller one is a failure
+_SMALLEST_PX: Final = 6.0  # minimum side of the box, below which tracking fails
 
 
 class _Filter:
@@ -258,7 +258,7 @@ class _Filter:
         self._below: Floats | None = None
 
     def learn(self, spectrum: Spectrum) -> None:
-        """Learn from a patch's spectrum (channels first): the first one fully, later ones by the learning rate."""
+        """Learn from a patch's spectrum (channels first): the first replaces the filter, later ones are blended in."""
         above = np.conj(self._wanted) * spectrum
         below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
         if self._above is None or self._below is None:
@@ -276,7 +276,7 @@ class _Filter:
 
 
 class CorrelationTracker(Tracker):
-    """Tracks a target's position and size by correlation filters. Fast, and the default.
+    """Tracks a target's position and size with correlation filters. Fast, and the default.
 
     It follows a target that changes slowly and moves by less than half its size between images. The score is the height
     of the correlation peak: about 1 for the image that it was learned from. Below ``lost_below`` the target counts as
@@ -288,7 +288,7 @@ class CorrelationTracker(Tracker):
         """Prepare the tracker.
 
         Args:
-            lost_below: Score below which the target is lost.
+            lost_below: Score below which the target counts as lost.
             learn_above: Score below which nothing is learned.
 
         Raises:
@@ -363,7 +363,7 @@ class CorrelationTracker(Tracker):
         return np.asarray(np.fft.rfft2(features(self._cv, pixels) * self._window), np.complex64)
 
     def _scale_spectrum(self, image: Image) -> Spectrum:
-        """Return the spectrum of each of the target's features over the sizes, (features, _SCALES // 2 + 1)."""
+        """Return the spectrum of each target feature across sizes, (features, _SCALES // 2 + 1)."""
         width, height = self._scale_sampled
         largest = float(self._steps[-1])
         finer = (round(width * largest * 1.5), round(height * largest * 1.5))
@@ -463,7 +463,7 @@ class MedianFlowTracker(Tracker):
         return found, min(score, 1.0)
 
     def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return the points' new positions and return distances, and which points could be tracked."""
+        """Return the points' new positions, how far off each is after tracking back, and which were tracked."""
         cv = self._cv
         points = before.reshape(-1, 1, 2)
         after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
@@ -499,9 +499,9 @@ def _stretch(before: Floats, after: Floats) -> float:
 
 
 class LearnedTracker(Tracker):
-    """Tracks by a neural network that OpenCV runs on the CPU. The score is the network's own.
+    """Tracks by a neural network that OpenCV runs on the CPU. The score is the one returned by the network.
 
-    Skyloop doesn't include the weights: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, NanoTrack's
+    Skyloop doesn't include the weights: the OpenCV Zoo offers object_tracking_vittrack_2023sep.onnx, and NanoTrack's
     repository has its two files.
     """
 
@@ -511,7 +511,7 @@ class LearnedTracker(Tracker):
         Args:
             weights: ONNX file of ViTTrack or, together with ``head``, of NanoTrack's backbone.
             head: ONNX file of NanoTrack's neck and head.
-            lost_below: Score below which the target is lost.
+            lost_below: Score below which the target counts as lost.
 
         Raises:
             MissingExtraError: OpenCV is not installed.

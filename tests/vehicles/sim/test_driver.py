@@ -326,7 +326,7 @@ def test_several_drones_fly_in_one_world() -> None:
 def test_one_drone_has_one_driver() -> None:
     host = SimHost(SimOptions(cameras=()), drones=1)
     with opened(riding(host, 0)) as (_, heard):
-        with pytest.raises(UsageError, match="is taken already"):
+        with pytest.raises(UsageError, match="is already taken"):
             riding(host, 0).open(RecordingSink())
         told = heard.feedback_count
         assert heard.wait(lambda: heard.feedback_count > told + 2, 5.0)  # the first one is not disturbed

@@ -1,7 +1,7 @@
 """Drawing with the ``kernels``, compiled by Numba if it is installed: the same images, several times faster.
 
 Importing Numba takes almost a second, and the first compilation takes longer; from then on the machine code is in
-Numba's cache on disk. No image waits for either: both happen on a separate thread.
+Numba's cache on disk. No image has to wait for either: both happen on a separate thread.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CONSTANTS: Final = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Kernels:
-    """The functions of ``kernels``, by default uncompiled."""
+    """The functions of ``kernels``, uncompiled by default."""
 
     prepare: Callable[..., int] = kernels.prepare
     draw: Callable[..., None] = kernels.draw
@@ -42,7 +42,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels. See :class:`Painter`."""
+    """Draws with the functions of ``kernels``. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
@@ -62,7 +62,7 @@ class CompiledPainter(Painter):
     ) -> None:
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
-        if self._fixed is None or self._fixed[0] is not quads.texture:  # fixed for a scene, even if its parts move
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # constant while parts move
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
             origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
             self._fixed = quads.texture, weight, origin
@@ -118,7 +118,7 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
     """Return the number of grid rows needed for each row of the image, and how many of the last ones to keep."""
     height, width = raster.rays.x.shape
     row = raster.lookup.reshape(height, width) // raster.grid.width
-    # Include the row below, for its samples and to find out whether they differ from those above.
+    # Include the row below, whose samples are needed and have to be compared with those above.
     rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
     at_once = -(-kernels.BLOCK // width) + 1  # rows of the image
     first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]
@@ -130,14 +130,14 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
 class Compiler:
     """Compiles the kernels once for this process, on a separate thread.
 
-    At its end the process waits only for the function being compiled at that moment, not for all of them, because LLVM
-    must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
+    When the process ends, it waits only for the function being compiled at that moment, not for all of them, because
+    LLVM must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
     ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
         self.kernels: Kernels | None = None  #: None until compiled
-        self.problem = ""  #: why there are no kernels; empty until this is known
+        self.problem = ""  #: reason why there are no kernels; empty while unknown
         self._load = load or load_kernels
         self._lock = threading.Lock()
         self._compiling = threading.Lock()
@@ -164,7 +164,7 @@ class Compiler:
             self.kernels = functions
         except ImportError as error:
             self.problem = f"Numba is not installed: {error}"
-        except Exception as error:  # noqa: BLE001  a compiler may raise anything; drawing works without it
+        except Exception as error:  # noqa: BLE001  compilers raise all kinds of errors, and drawing works without one
             self.problem = f"Numba can't compile here: {(str(error) or repr(error)).splitlines()[0]}"
             _log.warning("pictures are drawn without compiled code, which takes several times longer: %s", self.problem)
 
@@ -179,7 +179,7 @@ class Compiler:
 def load_kernels() -> Kernels:
     """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
-    RuntimeError if Numba's cache is not writable, so that every start would spend seconds on compilation.
+    RuntimeError if Numba's cache is not writable, because every start would then spend seconds compiling.
     """
     import numba
 
@@ -200,5 +200,5 @@ def _draw_once(functions: Kernels) -> None:
     painter.paint(shapes.build(), np.ones(1, np.bool_), [shadow], pose, np.empty((8, 8, 3), np.uint8))
 
 
-#: The compiler of this process.
+#: The compiler shared by the whole process.
 COMPILER: Final = Compiler()

@@ -1,12 +1,12 @@
-"""The planar renderer's work as loops over quads and pixels that Numba can compile (``compiled``).
+"""The planar renderer's loops over quads and pixels, in a form that Numba can compile (``compiled``).
 
 The loops compute the same as ``shading``, operation by operation in the same order and precision, so
 the image is identical bit by bit; that module explains the mathematics. They also run uncompiled, slowly, for tests
 without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
 hold the interpreter lock.
 
-Inner loops are short, write one array each and stay in single precision, because others would not become vector
-instructions. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
+Inner loops are short, write one array each and stay in single precision, because otherwise they would not be
+vectorised. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _ROUND = np.float32(3 << 22)  # adding and subtracting this rounds a number up t
 
 
 def prepare(
-    vectors: Floats,  # see ``Quads``, also for the next three
+    vectors: Floats,  # see ``Quads``, which also describes the next three
     starts: Floats,  # see ``Quads``
     two_sided: NDArray[np.bool_],  # see ``Quads``
     lit: NDArray[np.bool_],  # see ``Quads``
-    shown: NDArray[np.bool_],  # whether to draw a quad at all, (n,)
-    weight: Floats,  # factor on each quad's inverse depth, from its priority, (n,)
+    shown: NDArray[np.bool_],  # whether each quad is drawn at all, (n,)
+    weight: Floats,  # factor applied to each quad's inverse depth, from its priority, (n,)
     density: Floats,  # see ``Quads``
     origin: Floats,  # x, y and span in the atlas of each quad's texture, (n, 3)
     position: Floats,  # position of the camera
@@ -45,14 +45,14 @@ def prepare(
     constants: Floats,
     grid: Floats,  # width, height, fx, fy, cx, cy
     pixel_area: float,  # 1/(fx fy) of the image
-    # output: planes through the edges of each selected quad, as slopes on the grid along x and y, and start, (n, 4, 3)
+    # output: edge planes of each selected quad, as slopes along the grid's x and y and an offset, (n, 4, 3)
     edges: Floats,
-    planes: Floats,  # output: each selected quad's 1/z on the grid as slope along x, slope along y and start, (n, 3)
+    planes: Floats,  # output: each selected quad's 1/z on the grid, as slopes along x and y and an offset, (n, 3)
     # output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4)
     box: NDArray[np.int64],
     table: Singles,  # output: see ``sampling_table``, (13, n + 1)
 ) -> int:
-    """Select the quads that may be visible, like ``visible_quads`` and ``sampling_table``.
+    """Select the quads that may be visible, as ``visible_quads`` and ``sampling_table`` do.
 
     Returns:
         The number of selected quads.
@@ -92,7 +92,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # with a margin of two samples for rounding, because the edges decide
+        if ahead:  # add a margin of two samples for rounding, because the edge planes decide
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx
@@ -148,28 +148,28 @@ def draw(
     rows_for: NDArray[np.int64],  # number of grid rows needed for each row of the image, (height,)
     ray_x: Singles,  # x of each pixel's ray (x, y, 1), (height, width)
     ray_y: Singles,  # y of each pixel's ray, (height, width)
-    sample_x: Singles,  # x of the ray of each column of the grid
-    sample_y: Singles,  # y of the ray of each row of the grid
+    sample_x: Singles,  # x of the ray through each column of the grid
+    sample_y: Singles,  # y of the ray through each row of the grid
     nearest: Singles,  # work array: 1/z at each sample of a band, (BAND, columns)
     numbers: NDArray[np.int32],  # work array, (BAND, columns)
-    # Work array: the table's column for each sample, 0 for none, with the sign bit set if a sample may differ from its
-    # neighbours to the right and below. Holds the last processed grid rows, as many as the image needs at a time; a
-    # power of two. (rows, columns).
+    # Work array: each sample's column in the table, or 0 for none; the sign bit is set if the sample may differ from
+    # its neighbours to the right and below. Holds the most recently processed grid rows, as many as the image needs at
+    # a time, rounded up to a power of two. (rows, columns).
     seen: Shorts,
-    pairs: NDArray[np.int64],  # the atlas: each texel and the next one, BGRA each, in one number
+    pairs: NDArray[np.int64],  # each texel of the atlas and the one after it, BGRA each, packed into one number
     atlas_size: tuple[int, int],  # number of rows and columns of the atlas
     gap: float,  # gap between two levels of a texture in the atlas [texels]
-    farthest: float,  # 1/z to assume for a ray beyond a quad's horizon [1/m]
+    farthest: float,  # 1/z assumed for a ray that points beyond a quad's horizon [1/m]
     # box of each shadow: first row, row after the last, first column, column after the last, (s, 4)
     boxes: NDArray[np.int64],
     axes: Singles,  # rotation from optical to world axes
-    # numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it, (s, 7)
+    # ``Placed.numbers``: below, away x, away y, squared radius, strength, thickness, its constant part, (s, 7)
     shadows: Singles,
     picture: NDArray[np.uint8],  # output: BGR, (height, width, 3)
-    # the image's memory as one number per pixel except the last, at intervals of three bytes
+    # the image's memory, read as one number per pixel except the last, at intervals of three bytes
     packed: NDArray[np.int32],
 ) -> None:
-    """Draw an image like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+    """Draw the same image as ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
     For each band of the grid, find the nearest quad at each sample. Then colour the image rows that need no further
     bands, while this band is still in the cache.
@@ -183,7 +183,7 @@ def draw(
     scale_x, scale_y, start_x, start_y = to_grid[0], to_grid[1], to_grid[2], to_grid[3]
     height, width = ray_x.shape
     grid_rows, columns = len(sample_y), len(sample_x)
-    kept = len(seen) - 1  # mask that turns a grid row into its row in ``seen``
+    kept = len(seen) - 1  # mask that converts a grid row to its row in ``seen``
     kept_, columns_ = np.int32(kept), np.int32(columns)
     seen_ = seen.reshape(-1)
     wide = float(columns)
@@ -197,7 +197,7 @@ def draw(
             crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
     differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
     none, sign = np.int16(0), np.int16(~NUMBER)
-    room = 5 * BLOCK  # space for each pixel, and for its four samples where they differ
+    room = 5 * BLOCK  # one entry per pixel, plus four for its samples if they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -246,8 +246,8 @@ def draw(
                 for n in range(columns):
                     line[n] = shown[n]
             known = bottom
-            # A few rows at a time: first the bits that differ within a column, including the row below, then the bits
-            # that differ from the next column.
+            # Process a few rows at a time: first set the bits for differences within a column, including the row below,
+            # then those for differences from the next column.
             last = bottom if bottom == grid_rows or samples == 1 else bottom - 1
             while compared < last:
                 end = min(compared + FEW, last)
@@ -267,7 +267,7 @@ def draw(
                     for n in range(columns):
                         line[n] |= near_by[n]
                 compared = end
-        # The quad at each pixel, and the pixels with several quads.
+        # Find the quad at each pixel, and the pixels with several quads.
         xs, ys = flat_x[begin : begin + count_], flat_y[begin : begin + count_]
         for n in range(count_):
             at_x, at_y = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
@@ -294,7 +294,7 @@ def draw(
                     y_[total], y_[total + 1] = sample_y[row], sample_y[row]
                     y_[total + 2], y_[total + 3] = sample_y[row + 1], sample_y[row + 1]
                     total += 4
-        # Coefficients of the texture coordinates: per run of pixels in a row with the same quad, then per sample.
+        # Compute texture coordinate coefficients per run of pixels in a row with the same quad, then per sample.
         start = 0
         while start < count_:
             quad = number[start]
@@ -413,7 +413,7 @@ def draw(
                     rim = rim if off < thickness * depth[n] + more else zero
                     shade[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))
                 for n in range(len(out)):
-                    # Divide by 255, rounded to nearest, with shifts.
+                    # Divide by 255 with shifts, rounding to nearest.
                     dark = np.int32(np.int32(shade[n] * np.int32(out[n] & 0xFF00FF)) + 0x800080)
                     green = np.int32(np.int32(shade[n] * np.int32(np.int32(out[n] >> 8) & 0xFF)) + 0x80)
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)

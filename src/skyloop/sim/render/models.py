@@ -73,7 +73,7 @@ class Figure:
     """A figure's parts: the rigid body, and limbs that swing about their upper ends."""
 
     body: Quads
-    #: equally large groups of quads, one per joint, each with its joint as origin; None without limbs
+    #: one group of quads per joint, all of the same size and with the joint as their origin; None if there are no limbs
     limbs: Quads | None
     joints: Floats  #: positions of the joints, (limbs, 3)
     swings: Floats  #: forward swing of each limb in the middle of a step [rad], (limbs,)
@@ -285,7 +285,7 @@ _ARM_M = 0.16
 _ROTOR_M = 0.10
 _FEET_M = 0.06  # distance of the feet below the body's origin
 _DARK: Rgb = (46, 48, 52)
-_POLE_M = 12.0  # length of the stand's pole, which goes through the floor and is hidden below it
+_POLE_M = 12.0  # length of the stand's pole, which extends through the floor and is hidden below it
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
@@ -337,7 +337,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def target(atlas: AtlasBuilder, target: Target) -> Quads:
-    """Return a target's shape without its stand. A figure is at rest."""
+    """Return a target's shape without its stand. Figures are at rest."""
     if isinstance(target, BoardTarget):
         return board(atlas, target)
     if isinstance(target, FigureTarget):
@@ -349,7 +349,7 @@ def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
     """Return a marker's card in front of a wooden board on a pole; origin is the card's centre, x its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # from face axes (right, up, normal) to (x ahead, y left, z up)
+    # rotates face axes (right, up, normal) to (x ahead, y left, z up)
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     half = target.pattern.card_size_m / 2 + 0.02
     wood = atlas.add(("board", round(half, 3)), lambda: draw_surface("wood", 2 * half, 2 * half, min(256, 96 / half)))
@@ -380,7 +380,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     body.box((-narrow, -narrow, -2 * z - _POLE_M), (narrow, narrow, -2 * z), paint(atlas, _DARK))
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # from face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
+    # rotates face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 
@@ -390,7 +390,7 @@ _PAPER = 235
 
 
 def draw_card(pattern: MarkerPattern) -> tuple[Image, tuple[float, float, float, float]]:
-    """Draw a marker with its margin, BGR; return also the visible left, top, right, bottom in fractional texels.
+    """Draw a marker with its margin, BGR; also return the visible left, top, right, bottom in fractional texels.
 
     The black square takes up ``pattern.size_m`` of the card's ``card_size_m``, accurate to a fraction of a texel.
     """

@@ -1,6 +1,6 @@
 """Drawing of images: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
 
-That painter is used without compiled code and until compilation is done.
+It is used until compilation is done, or always if compiled code is not available.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from skyloop.sim.render.shading import DepthBuffer, Grid, Placed, Rays, Shader, 
 class Raster:
     """Precomputed values for a lens: the positions of its samples on a distortion-free grid.
 
-    A pixel has one sample, the grid point nearest to its centre, or the four around its centre. Without distortion,
-    these are exactly a quarter of a pixel to each side.
+    A pixel has either one sample, at the grid point nearest to its centre, or four, at the points around its centre.
+    Without distortion, these are exactly a quarter of a pixel to each side.
     """
 
     grid: Grid
     samples: int  #: samples per pixel: 1 or 4
-    #: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two below
-    #: these.
+    #: Flat index on the grid of each pixel's first sample, (pixels,). The other three are to its right, below it, and
+    #: below and to its right.
     lookup: NDArray[np.int32]
-    #: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the start,
-    #: gives the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
+    #: Scales in x and y, then offsets in x and y. Scaling a ray (x, y, 1) from ``rays`` and adding the offsets gives
+    #: the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
     to_grid: NDArray[np.float32]
     sample_x: NDArray[np.float32]  #: x/z of each column of the grid
     sample_y: NDArray[np.float32]  #: y/z of each row of the grid
-    rays: Rays  #: rays of the pixels' centres
+    rays: Rays  #: rays through the pixel centres
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
@@ -49,11 +49,11 @@ def _raster(
 ) -> Raster:
     model = CameraModel("lens", width, height, 1.0, fx, fy, cx, cy, distortion)
     centre = _rays(model)
-    # Distances from a pixel's centre to its first sample, and from there to its last one, in samples.
+    # Distance from a pixel's centre to its first sample, and distance from the first to the last sample, in samples.
     fine, first, more = (2, 0.5, 1) if samples > 1 else (1, 0.0, 0)
     scale = np.array([fine * fx, fine * fy])
     low = centre.min(axis=0) * scale
-    # Without distortion the grid's samples are exactly the pixels' own; otherwise there is one extra.
+    # Without distortion, the grid's samples coincide with the image's pixels; otherwise the grid has one more.
     middle = np.ceil(1.0 - low) if model.distorted else first - low
     to_grid = np.concatenate([scale, middle + (0.5 - first)]).astype(np.float32)
     x, y = (np.ascontiguousarray(part.astype(np.float32).reshape(height, width)) for part in centre.T)
@@ -100,7 +100,7 @@ class PlainPainter(Painter):
         super().__init__(raster, model, atlas)
         self._shader = Shader(atlas)
         self._buffer = DepthBuffer(raster.grid)
-        # Steps from a pixel's first sample to each of its samples.
+        # Index offsets from a pixel's first sample to each of its samples.
         self._steps = (0, 1, raster.grid.width, raster.grid.width + 1)[: raster.samples]
         self._numbers = np.empty((raster.samples, len(raster.lookup)), np.int32)
         self._colours = np.empty((model.height, model.width, 4), np.uint8)
@@ -134,7 +134,7 @@ class PlainPainter(Painter):
     def _smooth(
         self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]
     ) -> None:
-        """Colour and average all samples of the pixels whose samples show different quads."""
+        """Colour the pixels whose samples show different quads, averaging all their samples."""
         raster = self.raster
         places = (raster.lookup[pixels] + np.array(self._steps, dtype=np.int32)[:, None]).reshape(-1)
         row = places // raster.grid.width

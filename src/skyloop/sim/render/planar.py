@@ -1,9 +1,9 @@
 """The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
 
-The first step finds the quad at each sample of the image, and the second colours each pixel once
+The first step determines which quad is at each sample of the image, and the second colours each pixel once
 (``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
-coloured and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens:
-nothing is resampled, and textures stay sharp.
+coloured and averaged, for smooth silhouettes. With distortion, the lens determines where the samples are, so nothing is
+resampled and textures stay sharp.
 
 :class:`PlainPainter` does this with NumPy and OpenCV. ``compiled`` does the same arithmetic in loops compiled by Numba,
 several times faster, once they are ready. Both give the same image, bit by bit, for the same scene, state, pose and
@@ -28,7 +28,7 @@ from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
-#: Number of images that a renderer draws before; for fewer, compilation would take longer than it saves.
+#: Number of images that a renderer draws before it compiles; for fewer, compilation takes longer than it saves.
 WORTH_COMPILING: Final = 30
 
 
@@ -43,8 +43,8 @@ class Quality(Enum):
 def use_one_core() -> None:
     """Restrict OpenCV to the calling thread in this whole process.
 
-    Images this small gain nothing from more threads, and OpenCV's workers would take up cores that proxies and
-    applications need. A process that only simulates calls this once at its start.
+    Images this small don't benefit from more threads, and OpenCV's workers would occupy cores that proxies and
+    applications need. A process that only runs a simulation calls this once when it starts.
     """
     cv2.setNumThreads(1)
 
@@ -62,8 +62,8 @@ def dimmed(picture: Image, light: float) -> Image:
 class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
-    :class:`SensorEffects` adds the latter. The renderer reuses buffers, so use it from one thread at a time. Several
-    renderers can share a scene. Without a compiler it never draws with compiled code.
+    :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so use it from one thread at a
+    time. Several renderers can share a scene. Without a compiler it never draws with compiled code.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class PlanarRenderer:
         self.quality = quality
         self._compiler = compiler
         self._pictures = 0
-        self._painters: dict[tuple[object, ...], Painter] = {}  # by lens
+        self._painters: dict[tuple[object, ...], Painter] = {}  # painters by lens
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
@@ -128,7 +128,7 @@ class PlanarRenderer:
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
-    """Precompute a lens's values, so that its first image needn't wait: 0.2 s for 960×720 pixels with distortion.
+    """Precompute a lens's values to save time on its first image: 0.2 s for 960×720 pixels with distortion.
 
     They are kept for all renderers in the process.
     """
@@ -144,14 +144,14 @@ def _doubled(model: CameraModel) -> CameraModel:
     return model.scaled(2.0)
 
 
-_NOISE_MARGIN = 61  # rows and columns of noise beyond the image's size, so that each frame uses another part
+_NOISE_MARGIN = 61  # extra rows and columns of noise around the image, so that each frame can use a different part
 _BLUR_FROM_PX = 0.8  # minimum length of visible blur
 
 
 class SensorEffects:
-    """The flaws of a camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
+    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use from one thread at a time.
 
-    The flaws of frame ``number`` depend only on the seed and the number, not on earlier frames.
+    The imperfections of frame ``number`` depend only on the seed and the number, not on earlier frames.
     """
 
     def __init__(self, model: CameraModel, seed: int = 0) -> None:
@@ -166,10 +166,10 @@ class SensorEffects:
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Apply the flaws to a BGR image of the camera's size, in place, and return it.
+        """Apply the imperfections to a BGR image of the camera's size, in place, and return it.
 
         The drone's angular velocity about its body axes (x forward, y left, z up), (3,), blurs the image over the
-        exposure; None for a drone that does not turn. ``number`` is the frame's.
+        exposure; None if the drone does not turn. ``number`` is the frame number.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
@@ -189,7 +189,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # The scene moves against the turn: about y (down) to the left, about x (right) down; roll is ignored.
+        # The scene moves to the left if the camera rotates about y (down), down if about x (right). Roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
@@ -197,7 +197,7 @@ class SensorEffects:
         steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
         right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
         across, along = abs(right).max(), abs(down).max()
-        # As small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
+        # Keep this as small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
         kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
         np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)
@@ -206,7 +206,7 @@ class SensorEffects:
 def _gain(model: CameraModel) -> Image | None:
     """Return exposure and vignetting in steps of 1/128; None if there is neither.
 
-    Vignetting is like cos⁴: it grows with the square of the distance from the centre.
+    Like a cos⁴ falloff, vignetting grows with the square of the distance from the centre.
     """
     if model.exposure_gain == 1.0 and model.vignetting == 0.0:
         return None

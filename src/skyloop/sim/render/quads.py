@@ -1,4 +1,4 @@
-"""The renderer's input and output, and textured convex quadrilaterals as arrays, with shapes and their textures.
+"""The renderer's input and output, textured convex quadrilaterals stored as arrays, and shapes with their textures.
 
 All textures are in one image, each with its smaller versions (mip levels) next to it.
 """
@@ -19,7 +19,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("the simulator", "sim", cause=str(error)) from error
 
-__all__ = ["cv2"]  # handed on; all else is this module's own
+__all__ = ["cv2"]  # re-exported; everything else is this module's own
 
 Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 
@@ -61,16 +61,16 @@ class Atlas:
 
     image: NDArray[np.uint8]  #: the image, BGRA (OpenCV samples four channels twice as fast as three)
     x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
-    y0: NDArray[np.float64]  #: row where each texture's level 0 starts, likewise
+    y0: NDArray[np.float64]  #: row where each texture's level 0 starts; same type and shape
     span: NDArray[np.float64]  #: twice the padded width of each texture
 
 
 class AtlasBuilder:
-    """Collects textures under keys, drawing each once, and packs them."""
+    """Collects textures by key, drawing each once, and packs them."""
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
-        self.images: list[Image] = []  #: textures so far by number, BGR, shape (h, w, 3)
+        self.images: list[Image] = []  #: textures added so far, in the order of their numbers, BGR, shape (h, w, 3)
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
         """Return the texture for ``key``. If there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
@@ -125,7 +125,7 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # number of corners, which are a quad's first vectors; then come the normal and the slopes of u and v
+_CORNERS = 4  # number of corners, a quad's first vectors; the normal and the slopes of u and v follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +137,12 @@ class Quads:
     """
 
     vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)
-    starts: Floats  #: starts of u and v, (n, 2) [texel]
+    starts: Floats  #: offsets of u and v, (n, 2) [texel]
     texture: NDArray[np.intp]  #: number in the atlas, (n,)
-    two_sided: NDArray[np.bool_]  #: whether it is also visible from behind, (n,)
+    two_sided: NDArray[np.bool_]  #: whether it is visible from behind as well, (n,)
     priority: NDArray[np.intp]  #: priority, (n,); the highest one in a plane is visible
     lit: NDArray[np.bool_]  #: whether it is brighter when facing the light, (n,); false for the sky
-    density: Floats  #: density, (n,) [texel/m²]
+    density: Floats  #: texels per area, (n,) [texel/m²]
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -169,16 +169,16 @@ class Quads:
 
     @property
     def u_start(self) -> Floats:
-        """Start of u [texel], (n,)."""
+        """Value of u at the origin [texel], (n,)."""
         return self.starts[:, 0]
 
     @property
     def v_start(self) -> Floats:
-        """Start of v [texel], (n,)."""
+        """Value of v at the origin [texel], (n,)."""
         return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
-        """Return these quads followed by other ones."""
+        """Return these quads with others appended."""
         return concatenate([self, other])
 
     def moved(self, position_m: Floats, rotation: Floats) -> Quads:
@@ -228,8 +228,8 @@ class QuadBuilder:
     ) -> None:
         """Add a rectangle as seen from the front: its lower left corner and its edges to the right and upwards [m].
 
-        The quad with the highest priority in a plane is visible; a ``lit`` one is brighter when facing the light.
-        ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
+        Of the quads in a plane, the one with the highest priority is visible; a ``lit`` one is brighter when facing the
+        light. ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -248,7 +248,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a quad (4, 3) cut from the textured rectangle that is given by the corner and the two edges."""
+        """Add a quad (4, 3) cut from the textured rectangle defined by the corner and the two edges."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))
@@ -273,8 +273,8 @@ class QuadBuilder:
     ) -> None:
         """Add an upright box that is visible from outside, between its lowest and highest corner [m].
 
-        A pair of ``sides`` is for those facing along x and along y. ``ends`` are top and bottom; None for the texture
-        along x.
+        A pair of ``sides`` holds the textures of the faces that face along x and along y; ``ends`` is for top and
+        bottom, by default the texture along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

@@ -30,9 +30,9 @@ class Posed:
 
 
 class Scene:
-    """The renderable parts of a world with a number of drones.
+    """The renderable parts of a world and its drones.
 
-    Building it draws all textures (some tenths of a second). It never changes afterwards, so renderers on several
+    Building it draws all textures (a few tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
     """
 
@@ -54,7 +54,7 @@ class Scene:
             for target, template in zip(world.targets, self._targets, strict=True)
             for part in ([template, self._stand] if isinstance(target, BoardTarget) else [template])
         ]
-        # All parts in the order of ``posed``, for properties that don't change with motion.
+        # All parts, in the order used by ``posed``, for properties that don't change with motion.
         self._everything = concatenate([self._static, *standing, *self._hulls])
         #: Number of the world's target that a quad belongs to, -1 for none, (n,).
         self.target_of = np.concatenate(
@@ -150,7 +150,7 @@ _LARGEST = 1280.0  # maximum number of texels along a side of a room's surface
 _AFAR_M = 150.0  # extent of the open ground
 _SKY_M = 400.0  # half the side of the sky
 SIDES = 6  #: quads per box; ``static_quads`` has the shell first, then boxes, panels, markers
-# Direction of solids' shadows: away from the light in ``shading``, but shorter, as in a room lit from all sides.
+# Direction of solids' shadows: away from the light in ``shading``, but short, as in a room lit from all sides.
 _LEAN = np.array([-0.16, 0.20])
 
 
@@ -209,7 +209,7 @@ def _shaded(picture: NDArray[np.uint8], light: NDArray[np.float32]) -> NDArray[n
 
 
 def _corner_dark(height: int, width: int, per_m: float, sides: float, top: float, bottom: float) -> NDArray[np.float32]:
-    """Return the light near edges, reduced by these fractions towards the sides, the top and the bottom."""
+    """Return the light falloff near edges: reduced by these fractions towards the sides, the top and the bottom."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / per_m
     y = (np.arange(height, dtype=np.float32) + 0.5) / per_m
     across = 1.0 - sides * (np.exp(-x / 0.35) + np.exp(-x[::-1] / 0.35))
@@ -303,7 +303,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
 
 
 def _sky() -> NDArray[np.uint8]:
-    """Draw a sky, from haze at the horizon to blue above. About the lowest quarter is below the horizon."""
+    """Draw a sky, from haze at the horizon to blue above. About the lowest quarter lies below the horizon."""
     rise = np.clip(1.0 - np.arange(256, dtype=np.float32) / 197.0, 0.0, 1.0)[:, None, None]
     low, high = np.array([226.0, 214.0, 198.0]), np.array([206.0, 156.0, 104.0])
     return np.broadcast_to(low + (high - low) * np.sqrt(rise), (256, 64, 3)).astype(np.uint8)

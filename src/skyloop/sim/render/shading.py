@@ -1,11 +1,11 @@
-"""Finding the quad visible at each sample of an image, and colouring the samples, with soft shadows.
+"""Find the quad visible at each sample of an image, and colour the samples, with soft shadows.
 
 Quads are found by geometry without clipping and a depth buffer. A ray r through the eye meets a convex polygon in front
 of the eye exactly if it is on the inner side of every plane through the eye and an edge: (v_i × v_{i+1}) · r has the
 same sign for all edges. This also holds for corners behind the eye, so nothing is clipped and no wall is lost at a
-grazing angle. On one row of the image, each edge becomes a bound on x. Across the image, 1/z is linear:
-1/z = (n · r) / (n · v_0). Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates",
-Graphics Hardware 1997.
+grazing angle. On one row of the image, each edge becomes a limit on x. Across the image, 1/z is linear: 1/z = (n · r) /
+(n · v_0). Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", Graphics Hardware
+1997.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from skyloop.sim.camera import CameraPose
 from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
 
-# How much closer a picture counts than the wall behind it, per step of priority, as a fraction of the distance.
+# Fraction of its distance by which a picture counts as closer than the wall behind it, per step of priority.
 PRIORITY_SHARE = 1e-3
-# Maximum distance of the eye from the plane of a quad that is edge-on and covers nothing visible [m].
+# Maximum distance between the eye and a quad's plane for the quad to count as edge-on and invisible [m].
 EDGE_ON_M = 1e-5
 _BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
 
@@ -41,7 +41,7 @@ class Grid:
 class View:
     """The quads that may be visible from a pose, and their position on the grid. All arrays have m as their first axis.
 
-    ``index``: numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
+    ``index``: indices in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
     ``height_m``: signed height of the eye above the plane, (m,). ``first``, ``end``: columns covered in each row,
     (m, height). ``box``: bounds x0, y0, x1, y1, (m, 4).
     """
@@ -55,7 +55,7 @@ class View:
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return a · b along the last axis of three, summed in order: independent of libraries, so always the same bits."""
+    """Return a · b along the last axis of three, summed in fixed order, so the bits don't depend on libraries."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
@@ -65,7 +65,7 @@ def turned(vectors: Floats, rotation: Floats) -> Floats:
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return those of the ``shown`` quads, (n,), that are individually visible from a pose through a grid.
+    """Return the ``shown`` quads, (n,), that would each be visible on its own from a pose through a grid.
 
     :class:`DepthBuffer` handles occlusion.
     """
@@ -92,7 +92,7 @@ def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid
 
 
 def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
-    """Return False for quads entirely beyond one side of the view or behind the eye. Corners (m, 4, 3) are optical."""
+    """Return False for quads wholly beyond one edge of the view or behind the eye. ``corners``: optical, (m, 4, 3)."""
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
     left, right = -(0.5 + grid.cx) / grid.fx, (grid.width - 0.5 - grid.cx) / grid.fx
     top, bottom = -(0.5 + grid.cy) / grid.fy, (grid.height - 0.5 - grid.cy) / grid.fy
@@ -106,7 +106,7 @@ def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.i
     slope_x = edges[..., 0] / grid.fx
     slope_y = edges[..., 1] / grid.fy
     start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
-    # An exactly level edge bounds no columns; with this tiny slope it includes all or none of a row.
+    # An exactly level edge does not bound any columns; with this tiny slope it includes all or none of a row.
     slope_x[slope_x == 0.0] = 1e-30
     crossing = (slope_y / -slope_x)[..., None] * np.arange(grid.height) + (start / -slope_x)[..., None]
     rising = (slope_x > 0.0)[..., None]
@@ -135,7 +135,7 @@ class DepthBuffer:
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
-        """Update :attr:`seen`. ``priority``: that of each quad in the view, (m,)."""
+        """Update :attr:`seen`. ``priority`` has one value per quad in the view, (m,)."""
         grid = self._grid
         slope = view.inverse_depth * (1.0 + PRIORITY_SHARE * priority)[:, None] / (grid.fx, grid.fy, 1.0)
         start = slope[:, 2] - slope[:, 0] * grid.cx - slope[:, 1] * grid.cy
@@ -182,10 +182,10 @@ CHUNK = 16384  # samples per batch: few enough for the working arrays to stay in
 SUN = np.array([0.33, -0.42, 0.85])
 TO_SUN = SUN / np.linalg.norm(SUN)
 AMBIENT, DIRECT = 0.74, 0.30
-UNIT = 128.0  # light 1.0 in the eight-bit gain
-# Factor on the pixel size when choosing a level: sharper textures for a little shimmer. Twice, as explained below.
+UNIT = 128.0  # eight-bit gain that represents a light of 1.0
+# Factor for the pixel size when choosing a level: sharper textures that shimmer slightly. Doubled, as explained below.
 FOOTPRINT = 2.0 * 0.6
-FARTHEST = np.float32(1e-6)  # 1/z to assume for a ray beyond a quad's horizon [1/m]
+FARTHEST = np.float32(1e-6)  # 1/z assumed for a ray that points beyond a quad's horizon [1/m]
 _ONE = 0x3F800000  # 1.0 as the bits of a float32
 
 
@@ -277,7 +277,7 @@ class Shader:
         dot(0, u)
         dot(3, v)
         np.divide(1.0, w, out=inverse)
-        # level = floor((floor(log2(footprint)) + 1) / 2), from the exponent bits; scale = 2^-level made of such bits
+        # level = floor((floor(log2(footprint)) + 1) / 2), from the exponent bits, which also give scale = 2^-level
         np.take(table[9], seen, out=scale, mode="clip")
         for _ in range(3):
             np.multiply(scale, inverse, out=scale)
@@ -310,7 +310,7 @@ class Shader:
         cv2.multiply(colours, light4, dst=colours, scale=1.0 / UNIT)
 
 
-# Maximum distance of a pixel from the plane of a shadow that darkens it, as a fraction of the pixel's depth.
+# Maximum distance from a shadow's plane at which it darkens a pixel, as a fraction of the pixel's depth.
 _THICKNESS = 4e-3
 _MORE_M = 4e-3
 _NEAR_M = 0.01
@@ -321,7 +321,7 @@ class Shadow:
     """A level round spot that gets less light."""
 
     centre_m: NDArray[np.float64]  #: centre in world axes
-    radius_m: float  #: radius of the edge
+    radius_m: float  #: outer radius
     strength: float  #: fraction of the light missing in the middle, 0 to 1
 
 
@@ -336,12 +336,12 @@ class Extremes:
 
     @staticmethod
     def along(values: NDArray[np.float32], axis: int) -> Extremes:
-        """Compute the extremes; axis 0 is for those of columns."""
+        """Compute the extremes; axis 0 gives those of the columns."""
         least, most = values.min(axis=axis), values.max(axis=axis)
         return Extremes(least, most, float(least.min()), float(most.max()))
 
     def span(self, low: float, high: float) -> tuple[int, int] | None:
-        """Return the first column or row that may see between two bounds, and the end; None if there is none."""
+        """Return the first column or row with values between two bounds and the one after the last, or None."""
         if not (low <= self.high and high >= self.low):
             return None
         where = ((self.most >= low) & (self.least <= high)).nonzero()[0]
@@ -370,8 +370,8 @@ class Placed:
     #: first row that may show the shadow, row after the last, first column, column after the last
     box: tuple[int, int, int, int]
     axes: NDArray[np.float32]  #: rotation from optical to world axes
-    #: its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius [m²];
-    #: strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m]
+    #: height of its plane above the camera [m]; camera's offset from its centre, east and north [m]; squared radius
+    #: [m²]; strength out of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m]
     numbers: NDArray[np.float32]
 
 

@@ -1,7 +1,7 @@
 """Procedurally drawn surfaces for worlds: every name in :data:`skyloop.sim.world.TEXTURES`.
 
-Materials (parquet, brick …) keep their scale at any size of the surface; objects (crate, door, window, posters) fill it
-once. All are reproducible: the same size and seed give the same pixels.
+Materials (parquet, brick …) have the same scale on surfaces of any size; objects (crate, door, window, posters) fill
+the surface once. All are reproducible: the same size and seed give the same pixels.
 """
 
 from __future__ import annotations
@@ -224,12 +224,12 @@ class Sheet:
         return (np.arange(self.height, 0, -1, dtype=np.float32) - 0.5)[:, None] / np.float32(self.per_m)
 
     def px(self, metres: float) -> int:
-        """Number of pixels for a length, at least 1."""
+        """Convert a length to pixels, at least 1."""
         return max(1, round(metres * self.per_m))
 
 
 def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed: int = 0) -> NDArray[np.uint8]:
-    """Draw a surface of a size in metres at a number of texels per metre, BGR, as seen upright."""
+    """Draw a surface, given its size in metres and the texels per metre, BGR, as seen upright."""
     if name not in _SURFACES and name not in PICTURES:
         raise UnknownNameError("texture", name, [*_SURFACES, *PICTURES])
     height, width = max(4, round(height_m * per_m)), max(4, round(width_m * per_m))
