@@ -240,7 +240,8 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
             before.stop()
             here.clear()
             here["network"] = after
-            until(lambda: rows(client)[0]["links"]["application"] == "up", "its connection leads to where it is now")
+            until(lambda: rows(client)[0]["transport"] == "network", "it is seen where it is now")
+            until(lambda: rows(client)[0]["links"]["application"] == "up", "its connection leads there")
             assert [(row["name"], row["transport"]) for row in rows(client)] == [("alpha", "network")]
             while (state := page.receive_json())["type"] != "state" or state["links"]["application"] != "up":
                 pass  # its page stays connected
