@@ -98,7 +98,7 @@ class UdpSender(UdpListener):
         super().__init__(Address(ConnectionKind.UDP_IN, "::" if family == socket.AF_INET6 else "", 0))
 
     def send(self, packet: Packet) -> None:
-        """Send a datagram to the peer, or to the configured address until something arrives."""
+        """Send a datagram to the packet's peer or, before one is known, to the configured address."""
         super().send(packet._replace(peer=packet.peer or self._to))
 
 
@@ -118,7 +118,7 @@ class _Stream(ByteStream):
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one at a time: even an open connection may have to wait."""
+    """A client of the autopilot's TCP server, which serves one client at a time: even an open connection may wait."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
@@ -141,7 +141,7 @@ _KINDS: Final[dict[ConnectionKind, type[MavlinkConnection]]] = {
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection to a host given as a number. Takes up to a second."""
+    """Open a connection to a host given by its numeric address. Takes up to a second."""
     return _KINDS[address.kind](address)
 
 

@@ -20,7 +20,7 @@ from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_bet
 from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may have moved to another port
+MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
 MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
@@ -49,7 +49,7 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was, which may have moved there
+        self._elsewhere: set[VehicleIdentity] = set()  # received after the chosen one, which may have moved there
         self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received at the same time
         self._received_ns = 0  # when the chosen one was last received
 
@@ -198,10 +198,10 @@ class CommandSender:
         return out
 
 
-AT_ONCE: Final = 4  #: maximum number of requests per tick, because a slow link needs room for other messages
+AT_ONCE: Final = 4  #: maximum number of requests per tick, to leave room for other messages on a slow link
 RETRY_S: Final = 3.0  #: time after which a message that arrives too slowly is requested again
 ENOUGH: Final = 0.5  #: fraction of the requested rate that is good enough
-PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, as the vehicle may not have the message
+PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, in case the vehicle does not have the message
 TRIES: Final = 4  #: number of requests at the shorter interval
 
 
@@ -213,7 +213,7 @@ class MessageIntervals:
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, the count then, number of requests
+        self._asked: dict[str, tuple[int, int, int]] = {}  # when counting began, the count then, number of requests
         self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
@@ -250,7 +250,7 @@ _WRAP: Final = 1 << 32  #: stamps in ms wrap around at this value, after 49 days
 
 
 class VehicleClock:
-    """Converts a vehicle's stamps to this host's clock, by ``TIMESYNC`` if plausible, else by the smallest delay."""
+    """Converts a vehicle's stamps to this host's clock, using ``TIMESYNC`` if plausible or else the smallest delay."""
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None  #: round trip of the best recent reply
@@ -311,8 +311,8 @@ _NAN: Final = math.nan
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     """Convert an external pose to a message.
 
-    The message has north, east, down [m] and the angles of a body with forward, right and down axes [rad]. Its time is
-    in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
+    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. Its
+    time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)

@@ -121,7 +121,7 @@ class MavlinkOptions:
     parameters: bool = True  #: whether to read the autopilot's parameters
     key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
-    world_origin: tuple[float, float, float] | None = None  #: in the same units
+    world_origin: tuple[float, float, float] | None = None  #: position on Earth of the world's origin, likewise
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 
@@ -234,7 +234,7 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
     if facing not in FACINGS:
         raise UnknownNameError("camera_facing of mavlink://", facing, FACINGS)
     if not 1 <= len(name) <= 64:
-        raise UsageError(f"{uri}: a camera's name has 1 to 64 characters")
+        raise UsageError(f"{uri}: a camera name must have 1 to 64 characters")
     return CameraOptions(
         source=source,
         name=name,

@@ -46,8 +46,8 @@ class VehicleState:
     def airborne(self) -> bool | None:
         """Whether it is off the ground under its own power; None if unknown.
 
-        An armed vehicle may be flying if it reports neither that nor its height, for example when it has just been
-        found again, or if it is low and its own report is late.
+        An armed vehicle may be flying if it reports neither flight nor height, for example just after being found
+        again, or if it is low and its own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
@@ -164,7 +164,7 @@ class Telemetry:
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix or either position.
+        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix and both positions.
 
         Without a fix, an autopilot's origin may be arbitrary, as for motion capture.
         """
@@ -318,7 +318,7 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
 
 def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
     status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
-    # Use the lowest-numbered battery, and no other even if it falls silent, because their charges differ.
+    # Always use the lowest-numbered battery, even if it stops reporting, because batteries differ in charge.
     batteries = telemetry.instances("BATTERY_STATUS", now_ns)
     first = next((each for each in batteries if each.battery_function not in _OTHERS), None)
     if first not in telemetry.instances("BATTERY_STATUS", now_ns, SLOW_S):

@@ -36,7 +36,7 @@ MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
 USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode needs
 _ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
 LONG_DELAY_S: Final = 2.0  #: a failsafe that starts later than this causes a warning
-CURVED_API: Final = (1, 46)  #: since this version (Betaflight 4.5), the lean for a stick follows the curve of its rates
+CURVED_API: Final = (1, 46)  #: API version (Betaflight 4.5) from which a stick's tilt follows its rate curve
 _PROCEDURES: Final = {
     BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
     INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
@@ -141,7 +141,7 @@ class Setup:
 
     @property
     def full_tilt_rad(self) -> float | None:
-        """Return the lean at full stick; None if unknown."""
+        """Return the tilt at full stick; None if unknown."""
         return None if self.angle_limit_deg is None else math.radians(self.angle_limit_deg)
 
     def tilt_curves(self) -> tuple[Curve, Curve]:
@@ -300,7 +300,7 @@ class Identification:
             self._questions.ask(Function.COMMON_SETTING, self._on_last, b"max_angle_inclination_rll\0")
 
     def _ask(self, function: Function, read: Read, needed: str = "", payload: bytes = b"") -> None:
-        """Request settings; ``needed`` names those without which no sticks can be sent."""
+        """Request settings; ``needed`` describes any that must be read before sticks can be sent."""
 
         def on_reply(reply: bytes | None) -> None:
             if reply is not None:

@@ -92,7 +92,7 @@ class RobotSession:
         self._velocity: Velocity | None = None  # velocity in force
         self._commanded_ns = 0  # when the velocity was commanded
         self._pending: _Pending | None = None
-        self._up: bool | None = False if options.ground else None  # whether it flies or drives, by the services
+        self._up: bool | None = False if options.ground else None  # whether it flies or drives, judging by the services
         self._refused = ""  # why a take-off was refused
         self._warned: set[str] = set()
 
@@ -154,7 +154,7 @@ class RobotSession:
         """Accept an action that is among the capabilities.
 
         A repeated take-off or landing (not ``new``) does not call the service again. Raises :class:`DriverError` if the
-        robot does not offer the service, is silent when asked to take off, or has already refused this take-off.
+        robot does not offer the service, sends no data before a take-off, or has already refused this take-off.
         """
         with self._lock:
             if isinstance(action, Velocity):

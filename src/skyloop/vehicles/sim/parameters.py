@@ -24,7 +24,7 @@ _LIMITS: Final = (
     ("limits.speed", "speed_m_s", "m/s", "greatest horizontal speed of a velocity set-point"),
     ("limits.takeoff_altitude", "takeoff_altitude_m", "m", "where a take-off ends"),
 )
-#: Each camera parameter's last part of the name, field in :class:`CameraModel`, unit, range and description.
+#: For each camera parameter: last part of the name, field in :class:`CameraModel`, unit, range and description.
 _CAMERA: Final = (
     ("fps", "fps", "1/s", (0.1, 240.0), "pictures a second of simulated time"),
     ("latency", "latency_s", "s", (0.0, 5.0), "from exposure to delivery"),
@@ -35,7 +35,7 @@ _CAMERA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterValues:
-    """The values of one drone's parameters. Limits are None if its firmware has its own."""
+    """The values of one drone's parameters. Limits are None if the firmware has its own limits."""
 
     limits: Limits | None
     cameras: tuple[CameraModel, ...]

@@ -14,7 +14,7 @@ from skyloop.sim.world import Vec3
 
 
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
-    """Convert a report to feedback; the options say whether it has the position, the velocity and the truth.
+    """Convert a report to feedback; the options select whether it includes position, velocity and truth.
 
     ``state`` is the flight state to report, which is less detailed for a vehicle that flies by set-points alone.
     """

@@ -142,7 +142,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
     ) -> None:
         number = drone + 1 if system is None else system
         if not 1 <= number <= 255:
-            raise UsageError(f"a system id is from 1 to 255, not {number!r}")
+            raise UsageError(f"a system id must be from 1 to 255, not {number!r}")
         if version not in (1, 2):
             raise UsageError(f"the MAVLink version is 1 or 2, not {version!r}")
         super().__init__(host, drone)

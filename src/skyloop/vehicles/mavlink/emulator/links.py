@@ -44,7 +44,7 @@ class Ports:
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports numbered from a base, which increases by 10 with each drone: its UDP port, the remote one, TCP.
+        """Return ports numbered from a base, which increases by 10 per drone: UDP port, remote UDP port, TCP port.
 
         The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` beyond port 65535.
         """

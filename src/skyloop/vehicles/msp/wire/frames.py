@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Final
 
 MOST: Final = 1024  #: longest payload that the parser waits for; the longest in use, mode names, is below 700 bytes
-LONG: Final = 255  #: size in version 1 which means that the actual size is in the next two bytes
+LONG: Final = 255  #: version 1 size value that means: the actual size is in the next two bytes
 LARGEST: Final = 0xFFFF
 
 
@@ -100,7 +100,7 @@ class Parser:
     """Finds frames in a byte stream that may contain other bytes. Never raises.
 
     After a bad checksum, the search resumes at the byte after the ``$``, so that a frame with missing bytes does not
-    cost the next one. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
+    take the next one with it. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
     """
 
     def __init__(self) -> None:

@@ -52,7 +52,7 @@ class Function(IntEnum):
     INAV_ANALOG = 0x2002
 
 
-# Layouts of payloads, or of those parts of them that every version has.
+# Layouts of payloads, or of the parts of them that every version has.
 _STATUS: Final = struct.Struct("<HHHIBHBB")
 _INAV_STATUS: Final = struct.Struct("<HHHHBI")
 _ATTITUDE: Final = struct.Struct("<hhh")
@@ -140,8 +140,8 @@ class Status:
     """Active sensors and modes, and the flags that prevent arming."""
 
     sensors: int  #: bits of :class:`Sensor`
-    modes: int  #: a bit for each active mode, in the order of ``BOXIDS``
-    flags: int | None = None  #: a bit for each flag that prevents arming; None if this reply has none
+    modes: int  #: one bit per active mode, in the order of ``BOXIDS``
+    flags: int | None = None  #: one bit per flag that prevents arming; None if the reply does not contain them
     count: int = 0  #: number of flags in this version; 0 if unknown
     cycle_us: int = 0  #: duration of one control loop [µs]
     load: int = 0  #: processor load [%]
@@ -376,7 +376,7 @@ def box_names(payload: bytes) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig:
-    """How the firmware reacts if the receiver falls silent."""
+    """How the firmware reacts to the loss of its receiver."""
 
     delay_s: float  #: time until the failsafe starts [s]
     landing_s: float  #: duration of a landing, or how long the motors keep running [s]
@@ -396,7 +396,7 @@ class FailsafeConfig:
 
 
 class OnLoss(IntEnum):
-    """The value that a channel takes 0.3 s after the receiver fell silent."""
+    """The value that a channel takes 0.3 s after the receiver is lost."""
 
     AUTO = 0  #: centred sticks and no throttle
     HOLD = 1

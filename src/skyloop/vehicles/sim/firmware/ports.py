@@ -68,7 +68,7 @@ def reserve_instance(
     ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
     runs: Callable[[int], bool] = lambda _: False,
 ) -> int:
-    """Return the first of ``most`` instance numbers whose ports are free, and reserve it within this process.
+    """Return the lowest of ``most`` instance numbers whose ports are free, and reserve it within this process.
 
     ``runs`` says whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError` if
     no number is free.
@@ -140,7 +140,7 @@ class Apart:
 
 
 class Relay:
-    """The keeper's side. Create it while there is only one thread, because this process leaves the computer's network.
+    """The keeper's end. Create it while the process has only one thread: the process leaves the computer's network.
 
     Raises OSError if that is not allowed.
     """
