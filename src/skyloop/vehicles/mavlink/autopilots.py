@@ -297,7 +297,7 @@ class Px4Profile(AutopilotProfile):
         """Return whether the vehicle can be armed; None while it does not report that.
 
         PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
-        allow arming, like one left over from a flight, the outcome does not apply to the mode in which a take-off
+        allow arming, such as one left over from a flight, the outcome does not apply to the mode in which a take-off
         begins. In that case only the position estimate is checked.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)

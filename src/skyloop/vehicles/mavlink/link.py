@@ -187,7 +187,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter; return why it failed, or None. Blocks for up to 0.9 s; not for the link's own thread."""
+        """Write a parameter; return why it failed, or None. Blocks up to 0.9 s: don't call it on the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()

@@ -213,10 +213,10 @@ class TakeoffSequence:
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
-        self.given_up = ""  #: the reason, once given up
-        self.taken_over = False  #: another operator chose a mode in the air
-        self.declined = False  #: given up because another operator chose a mode before it was armed
-        self.rose = False  #: it has left the ground
+        self.given_up = ""  #: why the take-off was given up; empty if it was not
+        self.taken_over = False  #: whether another operator chose a mode in the air
+        self.declined = False  #: whether it was given up because another operator chose a mode before it was armed
+        self.rose = False  #: whether the vehicle has left the ground
         self.lead_ns: int | None = None  #: when set-points began to be sent
         self.reason = ""  #: the vehicle's own reason for refusing to arm
         self._autopilot = autopilot
@@ -321,7 +321,7 @@ class TakeoffSequence:
         return height_m - self._ground_m > LEFT_GROUND_M
 
     def _is_cut_short(self, vehicle: VehicleState) -> bool:
-        """Return whether another operator chose position hold, in which take-offs also end, during the climb."""
+        """Return whether another operator chose position hold (in which take-offs also end) during the climb."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
         below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m

@@ -49,9 +49,9 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # received after the chosen one, which may have moved there
-        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received at the same time
-        self._received_ns = 0  # when the chosen one was last received
+        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen one, which may have moved there
+        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, heard from at the same time
+        self._received_ns = 0  # when the chosen vehicle was last heard from
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
         """Handle a message; return events about other vehicles, or about the chosen one's move to another port."""

@@ -121,7 +121,7 @@ class MavlinkOptions:
     parameters: bool = True  #: whether to read the autopilot's parameters
     key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
-    world_origin: tuple[float, float, float] | None = None  #: position on Earth of the world's origin, likewise
+    world_origin: tuple[float, float, float] | None = None  #: the world origin's position, in the same units
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 

@@ -73,7 +73,7 @@ class FlightOwnership:
     def take(self, action: AnyAction, vehicle: VehicleState | None, *, alone: bool, new: bool) -> None:
         """Record that this action puts the vehicle under our control.
 
-        ``alone``: a failsafe requested it while no pilot was in command; ``new``: an application newly requested it.
+        ``alone``: whether a failsafe requested it with no pilot in command; ``new``: whether an application just did.
         """
         begins = not self._steering or not isinstance(action, _SET_POINTS)
         if alone or (new and begins):

@@ -1,4 +1,4 @@
-"""Access to the autopilot's parameters over MAVLink, and their names under ``mavlink.`` with their types. Pure."""
+"""Access to the autopilot's parameters over MAVLink, and their types and names under ``mavlink.``. Pure."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ LOST_NS: Final = nanoseconds(2.5)  #: time without data after which the link cou
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle that has sent no data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: time allowed for the parameter list, after which the link is up without it
 WAKING_MS: Final = 60_000  #: a vehicle that booted less than this ago and can't be armed is still starting up
-IDENTITY_NS: Final = nanoseconds(2.0)  #: time allowed for a vehicle found again to prove that it is the same
+IDENTITY_NS: Final = nanoseconds(2.0)  #: time allowed for a rediscovered vehicle to prove that it is the same one
 QUIET_ATTITUDE_S: Final = 0.5  #: if no attitude arrives for this long, other messages trigger feedback
 VERSION_PACE_S: Final = 1.0  #: time between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
@@ -119,7 +119,7 @@ class MavlinkSession(VehicleSession):
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
         self._peer = options.peer  # the chosen vehicle's address, kept while the link is lost
-        self._slow_heartbeat = False  # lost while armed, when regular heartbeats would hold off its own failsafe
+        self._slow_heartbeat = False  # True if lost while armed: regular heartbeats would hold off its own failsafe
         self._old = False  # whether the vehicle uses MAVLink 1
         self._signed = 0
         self._unencodable: set[str] = set()  # message types already reported as not encodable
@@ -161,7 +161,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # no effect, and on the ground pilots send it continuously
+            return action  # it has no effect, and pilots send it continuously on the ground
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
@@ -290,7 +290,7 @@ class MavlinkSession(VehicleSession):
             report = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
             if report != self._last_report:
                 self._last_report = report
-                self.due_ns = 0  # wake callers that wait for a mode
+                self.due_ns = 0  # wake callers that are waiting for a mode
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -497,7 +497,7 @@ class MavlinkSession(VehicleSession):
             self._publish_event(event_of(limits_text(self.limits), "limits"))
 
     def _on_version(self, version: Message, now_ns: int) -> None:
-        """Handle the vehicle's version. A vehicle found again counts as the same only if its version proves that."""
+        """Handle the vehicle's version. A rediscovered vehicle counts as the same only if its version proves it."""
         before, self._known_as, self.version = self._known_as, None, version
         same = True if before is None else _is_same(before, version)
         heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)

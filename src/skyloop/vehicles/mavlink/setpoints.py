@@ -55,7 +55,7 @@ CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: time at its height after which a take-off counts as complete in any mode
 DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after the vehicle was last seen armed
 IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground disarms itself within this time
-STEP_NS: Final = nanoseconds(0.04)  #: time between the steps of a take-off or landing that only wait for time to pass
+STEP_NS: Final = nanoseconds(0.04)  #: time between steps of a take-off or landing while they only wait
 HURRY_NS: Final = nanoseconds(0.008)  #: minimum time between a new set-point and the previous one
 
 
@@ -65,14 +65,14 @@ class Goal(Enum):
     NOTHING = auto()  #: no goal of ours: the vehicle is left to itself and to other operators
     TAKE_OFF = auto()
     FOLLOW = auto()  #: follow streamed set-points, including hovering
-    HOLD = auto()  #: hold position without a stream
+    HOLD = auto()  #: hold position without streaming set-points
     LAND = auto()
 
 
 class SetpointController:
     """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
-    ``make_thrust`` creates the thrust model for a flight by attitude; ``stop`` may be active already.
+    ``make_thrust`` creates the thrust model for an attitude-controlled flight; ``stop`` may be active already.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns, new=new)
         elif isinstance(action, Land):
-            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # a repeat keeps a foreign mode
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats respect foreign modes
                 self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
@@ -476,7 +476,7 @@ class SetpointController:
             return []
         self._ask_for(self._autopilot.HOLD, now_ns)
         if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
-            self._sent_ns = now_ns  # bridges the time until the mode is reported, or a refusal
+            self._sent_ns = now_ns  # stop it until the mode is reported, or in case it is refused
             return [velocity_message(Velocity(), self._commands.target)]
         return []
 

@@ -33,13 +33,13 @@ class VehicleState:
     status: int  #: MAV_STATE from the heartbeat
     landed: Landed
     ready: bool | None  #: whether it can be armed; None if unknown
-    position: Vector | None  #: position from its origin [m]
+    position: Vector | None  #: position relative to its origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
     altitude_m: float | None  #: height above its start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: whether it reports that it receives a remote control
-    heartbeat_ns: int = 0  #: when its newest heartbeat, which says whether it is armed, arrived
+    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which says whether it is armed
     reports_landed: bool = False  #: whether it has ever reported whether it is on the ground
 
     @property
@@ -70,7 +70,7 @@ class Telemetry:
         self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered current instance
         self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # for messages with several instances
         self._ground_down: float | None = None  # how far the ground is below the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same place on Earth
+        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; and that place on Earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Store a message from the selected vehicle."""
@@ -364,11 +364,11 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed after lift-off for a report from the air (PX4 sends one per second)
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off to a report of flying (PX4 sends one per second)
 
 
 class HealthMonitor:
-    """Reports each change in the vehicle's health once, and the vehicle's own texts."""
+    """Reports each change in the vehicle's health once, and passes on the vehicle's own texts."""
 
     def __init__(self) -> None:
         self._texts = Texts()

@@ -53,7 +53,7 @@ class Setup:
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
-    sticks_known: bool = False  #: whether those positions were reported and are not a guess
+    sticks_known: bool = False  #: whether those positions were reported rather than assumed
     rx: msp.RxConfig = field(default_factory=msp.RxConfig)
     failsafe: msp.FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
@@ -103,7 +103,7 @@ class Setup:
     def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
         """Return AUX channels [µs] that activate the required modes and as few others as possible.
 
-        ``given`` has the channels set by the user, counted from 0, except for the arm switch.
+        ``given`` contains the channels set by the user, counted from 0, except for the arm switch.
         """
         wanted = {self.number(ANGLE)}
         if arm:
@@ -257,7 +257,7 @@ _INAV_TUNING: Final = 7  # number of bytes in RC_TUNING up to the yaw rate
 _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
-Read = Callable[[Setup, bytes], dict[str, Any]]  #: the settings that a reply changes; raises DecodeError
+Read = Callable[[Setup, bytes], dict[str, Any]]  #: returns the settings that a reply changes, or raises DecodeError
 
 
 class Identification:

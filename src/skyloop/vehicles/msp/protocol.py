@@ -35,7 +35,7 @@ LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link cou
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller that has not replied by then is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
 MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an unacknowledged frame older than this is lost once a newer reply arrives
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: age from which an unacknowledged frame is lost once a newer reply arrives
 LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
 UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, it arms only once the arm switch has been off
@@ -452,7 +452,7 @@ class MspSession(VehicleSession):
     def _lose(self, reason: str, now_ns: int) -> None:
         """Start identifying it again while polling its state, so that control of a flying vehicle soon resumes.
 
-        It is sent :data:`LAST_STICKS` final frames, then only requests and stops, so that its own failsafe acts.
+        After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that its own failsafe acts.
         """
         del now_ns
         self._keep_part()

@@ -140,7 +140,7 @@ class SetpointController:
         self._refused: tuple[str, int] | None = None
         self._abort_ns: int | None = None
         self._still_ns: int | None = None
-        self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested climb rates, filtered alike
+        self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested climb, filtered with the same delay
         self._smooth_height = 0.0
         self._blind_ns: int | None = None
         self._sink = 1.0
@@ -280,7 +280,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                if heard:  # a take-off in progress must not arm it again; a link loss has ended any
+                if heard:  # a take-off in progress must not arm it again; after a link loss, there is none
                     self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:

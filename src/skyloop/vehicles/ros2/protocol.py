@@ -1,6 +1,6 @@
 """A robot as a vehicle: messages become samples for the proxy's sink, actions become velocities and service calls.
 
-This module does not need rclpy: a message is any object with the right fields, and a function calls services.
+This module does not need rclpy: any object with the right fields is a message, and a function calls services.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ class RobotSession:
         self._velocity, self._pending = None, pending
 
     def _fail_pending(self) -> None:
-        """Drop the pending action, and stop after a landing: a robot without watchdog would keep its last velocity."""
+        """Drop the pending action, and stop after a landing: without a watchdog, a robot keeps its last velocity."""
         if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
             self._velocity = Velocity()
         self._pending = None

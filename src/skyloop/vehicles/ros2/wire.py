@@ -83,7 +83,7 @@ class ClockMap:
 
 
 def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
-    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or all but zero."""
+    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or is almost zero."""
     length = math.sqrt(sum(each * each for each in quaternion))
     if not (math.isfinite(length) and length > 1e-6):
         return None
@@ -139,7 +139,7 @@ def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` as first number."""
+    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` in front."""
     found = [0.0] * (size * size)
     if not known:
         found[0] = NOT_KNOWN

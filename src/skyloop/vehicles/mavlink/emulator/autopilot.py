@@ -1,4 +1,4 @@
-"""Behaviour shared by both autopilots, which fly a simulated vehicle by messages. Pure except for the vehicle.
+"""Behaviour shared by both autopilots, which fly a simulated vehicle on command. Pure except for the vehicle.
 
 Times are on the autopilot's clock in simulated seconds, so that everything runs faster in a faster world.
 """
@@ -53,7 +53,7 @@ class Result(IntEnum):
 
 
 class Autopilot(AutopilotState):
-    """One autopilot. All methods belong to one thread. Set ``ports`` (its links) before the first report."""
+    """One autopilot. Call all its methods on one thread. Set ``ports`` (its links) before the first report."""
 
     CAPABILITIES: ClassVar[int]
     VERSION: ClassVar[int]
@@ -65,7 +65,7 @@ class Autopilot(AutopilotState):
     NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
     DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
-    WORDS: ClassVar[dict[str, str]]  #: its texts when it is armed, disarmed, auto_disarm (on the ground) or landed
+    WORDS: ClassVar[dict[str, str]]  #: its texts on being armed, disarmed, auto_disarm (on the ground) or landed
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, boot_s, gps)

@@ -103,7 +103,7 @@ def _decode_plain(data: bytes) -> Message | None:
 
 
 def _length_of(data: bytes) -> int | None:
-    """Return the length of the frame with which the data starts; None if there is none or too few bytes to tell."""
+    """Return the length of the frame at the start of the data; None if there is none or too little data to tell."""
     if len(data) < _LEAST or data[0] not in _MARKERS:
         return None
     if data[0] == dialect.PROTOCOL_MARKER_V1:

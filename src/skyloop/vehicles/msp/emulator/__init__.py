@@ -1,4 +1,4 @@
-"""An emulated racing drone with Betaflight, flying a simulated vehicle, for any program that uses MSP over TCP.
+"""An emulated Betaflight racing drone that flies a simulated vehicle and is open to any program using MSP over TCP.
 
 To use it in a test::
 
@@ -410,7 +410,7 @@ class Board:
 
 
 class RunningFirmware(RunningEmulator):
-    """A flight controller that is switched on. Belongs to the loop's thread."""
+    """A flight controller that is switched on. Use it only on the loop's thread."""
 
     def __init__(
         self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None

@@ -298,7 +298,7 @@ class Gps:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw sensor values. Only those of the gyroscope have the same unit on every board: degrees per second."""
+    """Raw sensor values. Only the gyroscope's have the same unit on every board: degrees per second."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]

@@ -96,7 +96,7 @@ def encode_state(state: FlightState) -> bytes:
 
 def decode_state(packet: bytes) -> FlightState:
     """Decode a state. Raises :class:`DecodeError`."""
-    n = _numbers(_STATE, packet, "a state")
+    n = _numbers(_STATE, packet, "state")
     return FlightState(
         n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
     )
@@ -109,16 +109,16 @@ def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
     """Decode a packet to port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
-    front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "the motors")
+    front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "motor packet")
     return front_right, rear_left, front_left, rear_right
 
 
 def _numbers(layout: struct.Struct, packet: bytes, what: str) -> tuple[float, ...]:
     if len(packet) != layout.size:
-        raise DecodeError(f"{len(packet)} bytes, where {what} of Betaflight have {layout.size}")
+        raise DecodeError(f"a Betaflight {what} has {layout.size} bytes, got {len(packet)}")
     numbers = layout.unpack(packet)
     if not all(map(math.isfinite, numbers)):
-        raise DecodeError(f"{what} of Betaflight have a number that is not finite: {numbers}")
+        raise DecodeError(f"a Betaflight {what} contains a number that is not finite: {numbers}")
     return numbers
 
 
@@ -372,7 +372,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def _wait_for_flight_control(link: socket.socket) -> None:
-    """Request its state until that shows that flight control has run. Raises OSError if it never does."""
+    """Request its state until it shows that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))

@@ -52,7 +52,7 @@ def become_prompt() -> None:
 def raise_priority() -> None:
     """Prioritize all threads of this process, and those that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. :func:`restore_priority`, called as often, restores it.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as often restores it.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:

@@ -98,7 +98,7 @@ _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 
 
 class Apart:
-    """The parent's side of the connection to a firmware in a separate network.
+    """The parent's side of the connection to firmware in a separate network.
 
     ``port`` is the TCP port on this computer that is forwarded to the firmware's TCP port.
     """
@@ -185,7 +185,7 @@ def leave_network() -> None:
     This requires root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
     """
     if sys.platform != "linux":
-        raise OSError("separate networks exist on Linux only")
+        raise OSError("separate networks exist only on Linux")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.unshare(_CLONE_NEWNET) and libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
         error = ctypes.get_errno()

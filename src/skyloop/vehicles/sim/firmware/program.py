@@ -23,9 +23,9 @@ from skyloop.sim.instruments import Readings
 from skyloop.vehicles.sim.firmware.keeper import PROMPT
 from skyloop.vehicles.sim.firmware.ports import Apart
 
-RESTART_S: Final = 1.0  #: time from the firmware's end to its next start, doubled after each early end
+RESTART_S: Final = 1.0  #: time from the firmware's exit to its next start, doubled after each early exit
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0  #: a process that ends within this time has ended early
+SOON_S: Final = 10.0  #: a process that exits within this time has exited early
 AT_ONCE: Final = 5  #: number of consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
@@ -196,7 +196,7 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
-    """Return the path of the firmware's program: the variable's, or the first name found on the search path."""
+    """Return the path of the firmware's program, given by the variable or found by name on the search path."""
     given = os.environ.get(variable)
     if given:
         path = Path(given).expanduser()
@@ -229,7 +229,7 @@ def _last_words(folder: Path) -> str:
 
 # Coupled to a simulation ---------------------------------------------------------------------------------------------
 
-WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, steps don't wait until it has replied
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, no more waits until it replies
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
 SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports it
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
@@ -256,7 +256,7 @@ class CoupledFirmware(ABC):
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
         self._on_event = on_event
-        self._starts = 0  # number of the start that created the coupled process
+        self._starts = 0  # which start of the firmware created the coupled process
         self._owed = False  # whether the last readings need a reply
         self._patient = False  # whether to wait for replies
         self._answered_s: float | None = None  # simulated time of this process's last reply

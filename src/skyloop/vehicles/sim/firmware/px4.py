@@ -1,7 +1,7 @@
 """PX4 in the simulated world, connected through MAVLink's hardware-in-the-loop messages and running in step with it.
 
-PX4 connects to a TCP server on port 4560, plus one for each further vehicle. ``HIL_SENSOR`` is its clock: PX4 replies
-to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
+PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is its clock: PX4
+replies to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """
 
@@ -53,8 +53,8 @@ PARAMETERS: Final = {
     "COM_OBL_RC_ACT": "5",
 }
 #: Names of the parameter for the GPS delay [ms] before and since early 2026; each version ignores the other name. PX4's
-#: startup for simulators sets 10. Because each fix has an outdated velocity, an underestimated delay turns PX4's
-#: heading while it flies circles in one direction.
+#: startup script for simulators sets it to 10. Because each fix has an outdated velocity, an underestimated delay turns
+#: PX4's heading while it flies circles in one direction.
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
 _EVERYTHING: Final = 0b1_1011_1111_1111  #: flags marking all readings except the differential pressure as new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
