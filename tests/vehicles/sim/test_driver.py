@@ -74,7 +74,7 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
         ("sim://?cameras=front,front", "names a camera twice"),
         ("sim://?speed=0", "option speed"),
         ("sim://?native=atitude", "no action named 'atitude'; did you mean 'attitude'"),
-        ("sim://?native=hover", "leaves no set-point"),
+        ("sim://?native=hover", "contains no set-point"),
         ("sim://?native=velocity,takeoff", "takeoff and land go together"),
         ("sim://?quality=ultra", "quality of pictures"),
         ("sim://?vehicle=ardron", "simulated vehicle"),

@@ -68,7 +68,7 @@ class CollectiveThrust:
 
 ThrustModel = ClimbRateThrust | CollectiveThrust
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-REACHED_M: Final = 0.2  #: a take-off counts as complete this far below its target altitude
+REACHED_M: Final = 0.2  #: distance below its target altitude at which a take-off counts as complete
 EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position
 EKF_RELATIVE_PLACE: Final = 0x08
 EKF_CONSTANT: Final = 0x80  #: flag in the same messages: the position is only assumed to be constant

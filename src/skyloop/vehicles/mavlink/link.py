@@ -145,7 +145,7 @@ def open_connection(address: Address) -> MavlinkConnection:
     return _KINDS[address.kind](address)
 
 
-WRITE_S: Final = 0.9  #: a write that is not confirmed within this time fails
+WRITE_S: Final = 0.9  #: time after which an unconfirmed write fails
 _CLOSE_S: Final = 3.0  #: time allowed for the thread to end
 
 

@@ -25,7 +25,7 @@ ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust wit
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
 ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitudes, each repeat of which turns the heading further: 50 Hz
 MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
-STOPPED_M_S: Final = 0.25  #: below this speed, a vehicle holds its position instead of a speed of zero
+STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
 STOPPING_S: Final = 3.0  #: time after which it holds its position in any case
 MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, used after a pause in the ticks
 WAY_M_S: Final = 1.0  #: default speed to a position
@@ -189,17 +189,17 @@ class AttitudeSetpoint:
 Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
-PATIENCE_NS: Final = nanoseconds(6.0)  #: an unarmed take-off is given up if not requested for this long
-RISING_NS: Final = nanoseconds(12.0)  #: an armed vehicle still on the ground by then will not take off; 4.5 s is usual
+PATIENCE_NS: Final = nanoseconds(6.0)  #: time without requests after which an unarmed take-off is given up
+RISING_NS: Final = nanoseconds(12.0)  #: time allowed for an armed vehicle to leave the ground; 4.5 s is usual
 ARM_PACE_S: Final = 1.0  #: time between repeated commands to arm or take off
 ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted without a confirming heartbeat
-LANDED_NS: Final = nanoseconds(2.5)  #: a landing that disarms the vehicle does so by then (PX4: after 2 s)
+LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
-CUT_SHORT: Final = 0.5  #: a take-off that holds below this fraction of its height was stopped by another operator
+CUT_SHORT: Final = 0.5  #: fraction of its height below which a hold means that another operator stopped a take-off
 CUT_SHORT_M: Final = 1.05  #: minimum shortfall for that: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
-STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long has been cancelled
+STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
 
 
 class TakeoffSequence:

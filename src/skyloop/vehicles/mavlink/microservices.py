@@ -40,7 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Without a system id it selects the first one found and keeps to that system from then on.
+    Without a system id, it selects the first system found and keeps it from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -244,8 +244,8 @@ ASK_NS: Final = nanoseconds(1.0)  #: time between TIMESYNC requests
 HURRY_NS: Final = nanoseconds(0.1)  #: time between the first few requests
 FIRST: Final = 5  #: number of requests at the shorter interval
 KEEP_NS: Final = nanoseconds(10.0)  #: how long a clock sample is used
-PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that appears older than this on arrival is from another clock
-BEHIND_MS: Final = 1000  #: a stamp that goes back by more than this may mean that the vehicle rebooted
+PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: age on arrival above which a stamp is assumed to be from another clock
+BEHIND_MS: Final = 1000  #: backward jump of a stamp above which the vehicle may have rebooted
 _WRAP: Final = 1 << 32  #: stamps in ms wrap around at this value, after 49 days
 
 
@@ -259,7 +259,7 @@ class VehicleClock:
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._watches: dict[str, RestartWatch] = {}  # by message name
+        self._watches: dict[str, RestartWatch] = {}  # keyed by message name
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:

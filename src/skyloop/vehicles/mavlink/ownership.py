@@ -16,7 +16,7 @@ from skyloop.vehicles.mavlink.manoeuvres import STRAYED_NS
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 
 LATE_NS: Final = nanoseconds(3.0)  #: longest delay before a requested mode change takes effect
-PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a pause longer than this is a new decision, not a repeat
+PAUSE_NS: Final = nanoseconds(0.5)  #: pause after which the same action is a new decision, not a repeat
 _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 

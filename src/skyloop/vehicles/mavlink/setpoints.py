@@ -54,7 +54,7 @@ DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: time at its height after which a take-off counts as complete in any mode
 DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after the vehicle was last seen armed
-IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground disarms itself within this time
+IDLES_NS: Final = nanoseconds(12.0)  #: time within which an autopilot left armed on the ground disarms itself
 STEP_NS: Final = nanoseconds(0.04)  #: time between steps of a take-off or landing while they only wait
 HURRY_NS: Final = nanoseconds(0.008)  #: minimum time between a new set-point and the previous one
 
@@ -99,8 +99,8 @@ class SetpointController:
         self._strayed_ns: int | None = None  # when the vehicle left the required mode again
         self._settling_ns: int | None = None  # when a take-off reached its height and began to wait for the next mode
         self._stepped_ns = 0  # time of the last step; 0 if there was none
-        self._arms_until_ns: int | None = None  # until then, a take-off aborted by a landing may arm the vehicle
-        self._disarms_until_ns = 0  # until then, a failed or interrupted take-off may arm the vehicle
+        self._arms_until_ns: int | None = None  # time until which a take-off aborted by a landing may arm the vehicle
+        self._disarms_until_ns = 0  # time until which a failed or interrupted take-off may arm the vehicle
         self._blind_until_ns = 0
         self._repeats_refused = ""  # why repeats of a take-off are refused
         self._events: list[VehicleEvent] = []

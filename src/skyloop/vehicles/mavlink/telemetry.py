@@ -16,12 +16,12 @@ from skyloop.messages.geometry import turned
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message, ModeFlag, SystemState, Texts
 
-FLOWING_S: Final = 1.0  #: attitude, position and velocity older than this count as unknown
+FLOWING_S: Final = 1.0  #: age above which attitude, position and velocity count as unknown
 SLOW_S: Final = 6.0  #: corresponding limit for slow messages such as battery and GPS
 LANDED_S: Final = 3.0  #: corresponding limit for the landed state
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-AIRBORNE_M: Final = 0.5  #: a vehicle that does not report whether it is flying counts as flying above this height
+AIRBORNE_M: Final = 0.5  #: height above which a vehicle that does not report whether it is flying counts as flying
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +67,8 @@ class Telemetry:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered current instance
-        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # for messages with several instances
+        self._newest: dict[str, tuple[Message, int]] = {}  # by kind, from the lowest-numbered current instance
+        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # by kind and number, where there are several
         self._ground_down: float | None = None  # how far the ground is below the origin [m]
         self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; and that place on Earth
 
@@ -166,7 +166,7 @@ class Telemetry:
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
         """Return where on Earth the origin of its axes is; None without a 3-D satellite fix and both positions.
 
-        Without a fix, an autopilot's origin may be arbitrary, as for motion capture.
+        Without a fix, an autopilot's origin may be arbitrary, as with motion capture.
         """
         gps = self.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is None or gps.fix_type < GOOD_FIX or self._on_earth is None:

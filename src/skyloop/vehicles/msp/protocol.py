@@ -32,14 +32,14 @@ from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Senso
 
 DEGRADED_NS: Final = nanoseconds(0.4)  #: time without data after which the link counts as degraded
 LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link counts as lost
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller that has not replied by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time without a reply after which a flight controller is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
 MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
 STICKS_LOST_NS: Final = nanoseconds(0.1)  #: age from which an unacknowledged frame is lost once a newer reply arrives
 LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
-UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, it arms only once the arm switch has been off
-LEAST_STICKS_HZ: Final = 25.0  #: a lower rate causes a warning
+UNTOLD_NS: Final = nanoseconds(0.5)  #: time without sticks after which it arms only once the arm switch has been off
+LEAST_STICKS_HZ: Final = 25.0  #: rate below which a warning is given
 BUNDLING_API: Final = (1, 42)  #: Betaflight's API version that introduced MULTIPLE
 _MODES_AT: Final = 6  # offset of the modes in STATUS
 WAKING_NS: Final = nanoseconds(8.0)  #: longest time after power-on in which temporary conditions prevent arming
@@ -76,7 +76,7 @@ class MspSession(VehicleSession):
         self._refused_variant = ""
         self._unread = ""  # settings that were not reported
         self._part = Setup()  # the settings read so far, which suffice for a stop
-        self._armed: bool | None = None  # as reported before the settings were read; None if not reported
+        self._armed: bool | None = None  # the state reported before the settings were read; None if not reported
         self._stop_waits = False  # whether a stop is waiting for the armed state to be known
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns

@@ -28,10 +28,10 @@ OFF_US: Final = 1000
 SPOOL_PER_S: Final = 0.15  #: rate at which the throttle rises during take-off, fraction of full throttle per second
 SPOOL_FROM: Final = 0.6  #: fraction of the hover throttle, if known, at which the rise begins
 IDLE: Final = 0.05  #: throttle at which the rise begins if the hover throttle is unknown
-ARM_NS: Final = nanoseconds(6.0)  #: arming has failed if not confirmed by then; Betaflight's BOOTGRACE is 5 s
+ARM_NS: Final = nanoseconds(6.0)  #: time allowed for arming to be confirmed; Betaflight's BOOTGRACE is 5 s
 NAMED_NS: Final = nanoseconds(0.4)  #: how long a reported obstacle to arming must last to count as a refusal
 REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
-ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has not started by then
+ASKED_NS: Final = nanoseconds(1.0)  #: time after which a requested take-off that has not started expires
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
 #: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
 PASSING: Final = frozenset(
@@ -48,12 +48,12 @@ PASSING: Final = frozenset(
     )
 )
 SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until it has an attitude
-LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s]; True if precise
-LATE_S: Final = {True: 0.35, False: 0.15}  #: lift-off delay after sufficient throttle; True if precise
+LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precision
+LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off
 OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the one at lift-off
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a descent stalled for this long has landed
-HEADWAY: Final = 0.4  #: a descent slower than this fraction of the requested rate counts as stalled
-STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which it is in the air; True if precise
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: stall time that counts as a touch-down
+HEADWAY: Final = 0.4  #: fraction of the requested rate below which a descent counts as stalled
+STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which it is airborne, by precision
 #: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
 #: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but a descent at 0.15 m/s remains visible.
 SMOOTH_S: Final = 0.4
@@ -207,7 +207,7 @@ class SetpointController:
             yaw_rate=clamped(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
-            self._enter(Phase.STANDING, now_ns)  # no longer requested, so it must not arm as soon as it can
+            self._enter(Phase.STANDING, now_ns)  # the take-off is no longer requested, so it must not arm later
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
             self._start(now_ns)  # takes off only if a take-off was requested, not for any other set-point
         return self._wanted

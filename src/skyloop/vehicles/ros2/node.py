@@ -30,7 +30,7 @@ DISCOVERY_VARIABLES: Final = (
 PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
 _OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
 _FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS 3
-MOST_DOMAIN: Final = 101  #: for higher domains, DDS's ports may be taken by outgoing connections on Linux
+MOST_DOMAIN: Final = 101  #: maximum domain: above it, outgoing connections on Linux may occupy DDS's ports
 SHARED_BYTES: Final = 16 * 2**20  #: shared memory per participant: several images; the default 512 KiB is too small
 
 #: A profile for Fast DDS: sockets only on loopback, and shared memory with room for images.

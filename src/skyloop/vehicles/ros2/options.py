@@ -33,7 +33,7 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 class Options:
     """Full names of a robot's topics and services, empty for those that it lacks, and the other options."""
 
-    namespace: str  #: with a leading slash
+    namespace: str  #: namespace with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
     info: str  #: ``sensor_msgs/CameraInfo``
     cmd_vel: str  #: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``

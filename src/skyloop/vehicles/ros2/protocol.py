@@ -330,7 +330,7 @@ def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
     return data, size
 
 
-PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older than this or in the future is from another clock
+PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: age above which a stamp is from another clock, as are future stamps
 
 
 class CaptureClock:

@@ -306,8 +306,8 @@ class SimDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
 
 
-LIFT_M_S: Final = 0.05  #: a set-point that climbs faster than this starts the motors
-DOWN_M: Final = 0.08  #: below this height, a descending drone counts as landed
+LIFT_M_S: Final = 0.05  #: climb rate of a set-point above which the motors start
+DOWN_M: Final = 0.08  #: height below which a descending drone counts as landed
 
 
 class SetpointController:

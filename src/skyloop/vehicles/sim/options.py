@@ -127,7 +127,7 @@ def _native(text: str | None) -> frozenset[str]:
     for name in names - EVERY_ACTION:
         raise UnknownNameError("action", name, EVERY_ACTION)
     if not names & {"velocity", "attitude"}:
-        raise UsageError(f"native={text} leaves no set-point: add velocity or attitude")
+        raise UsageError(f"native={text} contains no set-point: add velocity or attitude")
     if ("takeoff" in names) != ("land" in names):
         raise UsageError(f"native={text}: takeoff and land go together")
     return frozenset(names) | ALWAYS_NATIVE

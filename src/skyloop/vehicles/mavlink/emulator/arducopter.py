@@ -49,7 +49,7 @@ class ArduCopter(Autopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT
-    CAPABILITIES = 0xFBEF & ~0xD200  # without fences, rally points, terrain and files, which are not emulated
+    CAPABILITIES = 0xFBEF & ~0xD200  # excluding fences, rally points, terrain and files, which are not emulated
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
     FRAMES = frozenset({WORLD, WORLD_OFFSET, BODY, BODY_OFFSET})
@@ -132,7 +132,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without MAVLink input, the simulated one applies, with its throttle stick down."""
+        """Follow the remote control. Without MAVLink input, a simulated one with its throttle down applies."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:

@@ -65,7 +65,7 @@ class Autopilot(AutopilotState):
     NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
     DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
-    WORDS: ClassVar[dict[str, str]]  #: its texts on being armed, disarmed, auto_disarm (on the ground) or landed
+    WORDS: ClassVar[dict[str, str]]  #: texts for being armed, disarmed, auto_disarm (on the ground) and landed
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, boot_s, gps)

@@ -161,7 +161,7 @@ class Streams:
 OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
-PEER_NS: Final = nanoseconds(3.0)  #: a peer that has been silent for this long may be replaced by another
+PEER_NS: Final = nanoseconds(3.0)  #: time without data after which a peer may be replaced by another
 
 
 class Port(Protocol):

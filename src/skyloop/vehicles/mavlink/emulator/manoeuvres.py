@@ -138,7 +138,7 @@ def attitude_target_of(message: Message) -> AttitudeTarget:
     )
 
 
-_THERE_M: Final = 0.3  #: a return's waypoint closer than this counts as reached
+_THERE_M: Final = 0.3  #: distance within which a return's waypoint counts as reached
 
 
 class _Leg(Enum):

@@ -38,7 +38,7 @@ class Px4(Autopilot):
     """An emulated PX4."""
 
     AUTOPILOT = Number.PX4
-    CAPABILITIES = 0xE8FF & ~0xC025  # without files, missions, fences and rally points, which are not emulated
+    CAPABILITIES = 0xE8FF & ~0xC025  # excluding files, missions, fences and rally points, which are not emulated
     VERSION = 1 << 24 | 17 << 16
     RATES: ClassVar[dict[int, float]] = {
         m.MAVLINK_MSG_ID_HEARTBEAT: 1.0,

@@ -24,7 +24,7 @@ _BATTERY: Final = 0x2000000
 #: Estimator flags for a known position: relative and absolute, each current and predicted for flight. DroneKit waits
 #: for the last one.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
-POSES_S: Final = 1.0  #: without GPS, how long external poses must arrive before the position is known
+POSES_S: Final = 1.0  #: how long external poses must arrive before the position is known without GPS
 POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
 _COPIES: Final = 1 << 32
 _LANDED: Final = {

@@ -97,7 +97,7 @@ def _decode_plain(data: bytes) -> Message | None:
     attributes.update(kind.common)
     attributes.update(zip(kind.fields, kind.unpack(data[begin:end].ljust(kind.size, b"\0")[: kind.size]), strict=True))
     message._msgbuf, message._crc = bytearray(data), checksum
-    message._payload = message._msgbuf[_HEADER_V1.size : end]  # as in pymavlink, for both versions
+    message._payload = message._msgbuf[_HEADER_V1.size : end]  # pymavlink does this for both versions
     message._header = dialect.MAVLink_header(number, incompatible, compatible, length, sequence, system, component)
     return message
 

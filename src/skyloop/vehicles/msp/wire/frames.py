@@ -22,7 +22,7 @@ class Direction(Enum):
 
     REQUEST = ord("<")  #: sent to the flight controller
     REPLY = ord(">")
-    ERROR = ord("!")  #: the flight controller does not support the function or refuses it
+    ERROR = ord("!")  #: the flight controller refuses or does not support the function
 
 
 _DIRECTIONS: Final = {each.value: each for each in Direction}

@@ -381,7 +381,7 @@ class FailsafeConfig:
     delay_s: float  #: time until the failsafe starts [s]
     landing_s: float  #: duration of a landing, or how long the motors keep running [s]
     throttle_us: int  #: throttle during a landing [µs]
-    low_throttle_s: float  #: it disarms at once if the throttle was low for this long [s]
+    low_throttle_s: float  #: time with a low throttle after which it disarms immediately [s]
     procedure: int  #: Betaflight: 0 land, 1 drop, 2 GPS rescue; INAV: 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod

@@ -260,7 +260,7 @@ class Betaflight(CoupledFirmware):
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
                 raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
-        time.sleep(_PAUSE_S)  # until it is ready for the next connection: it accepts only one
+        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment for the next
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
@@ -325,7 +325,7 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # not running yet, or no longer
+        with suppress(OSError):  # it is not running yet, or has exited
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:

@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> int:
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
     def begin() -> None:
-        if libc is not None:  # because this process can't end the firmware if it is killed itself
+        if libc is not None:  # if this process is killed, it can't end the firmware
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if prompt:
             become_prompt()

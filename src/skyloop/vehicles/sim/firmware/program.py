@@ -25,7 +25,7 @@ from skyloop.vehicles.sim.firmware.ports import Apart
 
 RESTART_S: Final = 1.0  #: time from the firmware's exit to its next start, doubled after each early exit
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0  #: a process that exits within this time has exited early
+SOON_S: Final = 10.0  #: run time below which an exit counts as early
 AT_ONCE: Final = 5  #: number of consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
