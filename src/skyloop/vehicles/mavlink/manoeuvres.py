@@ -23,7 +23,7 @@ POSITION: Final = 0xDF8
 POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
-ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitudes, each repeat of which turns the heading further: 50 Hz
+ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitude set-points, each with a new heading in a turn: 50 Hz
 MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
 STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
 STOPPING_S: Final = 3.0  #: time after which it holds its position in any case
@@ -32,7 +32,7 @@ WAY_M_S: Final = 1.0  #: default speed to a position
 WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
 WAY_M_S2: Final = 0.8  #: acceleration at the start, and deceleration at the end, of a flight to a position
 LEASH_S: Final = 1.5  #: maximum lead of the sent position over the vehicle, as flight time at the requested speed
-LEASH_M: Final = 0.3  #: minimum of that lead as a distance
+LEASH_M: Final = 0.3  #: minimum lead, as a distance
 
 Target = tuple[int, int]  #: system and component
 

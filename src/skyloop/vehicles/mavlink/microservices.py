@@ -213,7 +213,7 @@ class MessageIntervals:
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int, int]] = {}  # when counting began, the count then, number of requests
+        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at that time, number of requests
         self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:

@@ -161,7 +161,7 @@ def address_of(uri: VehicleUri) -> Address:
     """Parse the part of an address that says where the vehicle is."""
     word, _, rest = uri.place.partition(":")
     if word not in [kind.value for kind in ConnectionKind]:
-        raise UsageError(f"{uri}: {word!r} must be one of {', '.join(ConnectionKind)}: {_EXAMPLES}")
+        raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
     kind = ConnectionKind(word)
     if kind is not ConnectionKind.SERIAL:
         found = host_and_port(rest)

@@ -264,7 +264,7 @@ def check_exact(name: str, number: int, *, bytewise: bool) -> int:
     received = struct.unpack("<f", struct.pack("<f", number))[0]
     if received != number:
         raise ParameterError(
-            f"{name}: the vehicle carries whole numbers in single precision and would receive {received:.0f} "
+            f"{name}: the vehicle takes whole numbers in single precision and would receive {received:.0f} "
             f"instead of {number}: beyond ±{EXACT} only some can be written; use a ground station",
             code=Refusal.OUT_OF_RANGE,
         )

@@ -43,7 +43,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
 REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session, for heartbeats, requests and silence checks
 HEARTBEAT_NS: Final = nanoseconds(1.0)
-SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: interval longer than the failsafes' 5 to 10 s
+SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: longer than the failsafes wait (5 to 10 s)
 QUIET_NS: Final = nanoseconds(0.5)  #: time without data until set-points are withheld: they might be followed late
 OLD_POSE_NS: Final = nanoseconds(0.5)  #: age beyond which a pose no longer says where the vehicle is
 DEGRADED_NS: Final = nanoseconds(1.2)  #: time without data after which the link counts as degraded

@@ -476,7 +476,7 @@ class SetpointController:
             return []
         self._ask_for(self._autopilot.HOLD, now_ns)
         if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
-            self._sent_ns = now_ns  # stop it until the mode is reported, or in case it is refused
+            self._sent_ns = now_ns  # stop it until the mode is reported, or if the mode is refused
             return [velocity_message(Velocity(), self._commands.target)]
         return []
 

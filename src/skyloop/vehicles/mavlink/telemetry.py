@@ -364,7 +364,7 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off to a report of flying (PX4 sends one per second)
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until it is reported airborne (PX4: once per second)
 
 
 class HealthMonitor:

@@ -158,7 +158,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def autopilot(self) -> Autopilot:
-        """The running autopilot, for tests. Belongs to the loop's thread."""
+        """The running autopilot, for tests. Use it only on the loop's thread."""
         return self._started.autopilot
 
     @property

@@ -490,7 +490,7 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def board(self) -> Board:
-        """The running flight controller, for tests. Belongs to the loop's thread."""
+        """The running flight controller, for tests. Use it only on the loop's thread."""
         return self._started.board
 
     @property
