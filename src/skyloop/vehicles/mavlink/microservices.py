@@ -283,7 +283,7 @@ class VehicleClock:
         return []
 
     def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
-        """Classify a message by its stamp as new, overtaken by others of its kind, or sent after a reboot."""
+        """Classify a message by its stamp as new, older than others of its kind, or sent after a reboot."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:

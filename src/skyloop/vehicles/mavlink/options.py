@@ -197,7 +197,7 @@ def _key(uri: VehicleUri) -> bytes | None:
         return held
     text = held.decode("ascii", "replace").strip()
     if not re.fullmatch(r"[0-9a-fA-F]{64}", text):
-        raise UsageError(f"{uri}: {given} holds no signing key: 32 bytes, or 64 hexadecimal digits")
+        raise UsageError(f"{uri}: {given} must contain a signing key: 32 bytes, or 64 hexadecimal digits")
     return bytes.fromhex(text)
 
 

@@ -461,7 +461,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle in a mode chosen elsewhere; return whether we may still hold or land it."""
+        """Leave the vehicle in a foreign mode; return whether we may still hold or land it."""
         why = "its own failsafe" if vehicle.failsafe else "not chosen here"
         self._notify(f"the vehicle changed to {vehicle.mode} ({why}): no more set-points are sent", reason="mode")
         self._end()

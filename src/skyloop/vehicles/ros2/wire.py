@@ -139,7 +139,7 @@ def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` in front."""
+    """Return a covariance matrix row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` as first element."""
     found = [0.0] * (size * size)
     if not known:
         found[0] = NOT_KNOWN

@@ -115,7 +115,7 @@ def share_of(curve: Curve) -> Curve:
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, for a value; full stick if the value is out of reach."""
+    """Return the stick, -1 to 1, for a value; full stick if the value can't be reached."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:

@@ -187,7 +187,7 @@ class ArduCopter(CoupledFirmware):
         self._instance: int | None = None
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
-        self._own_s = 0.0  # ArduCopter's own time, which pauses while it is silent
+        self._own_s = 0.0  # ArduCopter's own time, which pauses while it is not replying
         self._asked = False  # whether it is waiting for a state
 
     @property

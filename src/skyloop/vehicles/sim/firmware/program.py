@@ -242,7 +242,7 @@ class CoupledFirmware(ABC):
 
     It is a :class:`~skyloop.sim.instruments.Firmware`: pass it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread waits up to :data:`WAIT_S` for a reply; after a time-out it does not wait again until the
-    firmware has replied. The rotors stop if the firmware is silent or its process ends; in that case it is restarted.
+    firmware has replied. The rotors stop if it stops replying or exits; firmware that exits is restarted.
     """
 
     NAME: ClassVar[str]  #: the firmware's name in messages

@@ -88,7 +88,7 @@ class Px4(CoupledFirmware):
         self._sent = 0  # number of states sent
         self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer readings since the last state
         self._fix: GpsFix | None = None
-        self._own_us = STEP_US  # PX4's own time, which pauses while it is silent
+        self._own_us = STEP_US  # PX4's own time, which pauses while it is not replying
         self._wanted_us = 0  # commands older than this are replies to an earlier state
 
     @property
