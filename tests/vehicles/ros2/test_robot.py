@@ -42,7 +42,7 @@ def test_names_are_below_the_namespace_unless_they_begin_with_a_slash() -> None:
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        ("ros2://1robot", "is not a namespace"),
+        ("ros2://1robot", "is not a ROS 2 namespace"),
         ("ros2://robot?image=front-image", "option image is 'front-image'"),
         ("ros2://robot?image=&odom=", "name at least one"),
         ("ros2://robot?takeoff=takeoff&ground=1", "does not leave the ground"),

@@ -74,7 +74,7 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
         ("sim://?cameras=front,front", "names a camera twice"),
         ("sim://?speed=0", "option speed"),
         ("sim://?native=atitude", "no action named 'atitude'; did you mean 'attitude'"),
-        ("sim://?native=hover", "leaves no set-point"),
+        ("sim://?native=hover", "contains no set-point"),
         ("sim://?native=velocity,takeoff", "takeoff and land go together"),
         ("sim://?quality=ultra", "quality of pictures"),
         ("sim://?vehicle=ardron", "simulated vehicle"),
@@ -270,10 +270,10 @@ def test_values_written_before_opening_apply() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("limits.tilt", 9.0, "is from 0.02 to 0.6"),
-        ("limits.tilt", math.nan, "is from 0.02 to 0.6"),
-        ("limits.tilt", "much", "is made of numbers"),
-        ("limits.tilt", True, "is made of numbers"),
+        ("limits.tilt", 9.0, "must be from 0.02 to 0.6"),
+        ("limits.tilt", math.nan, "must be from 0.02 to 0.6"),
+        ("limits.tilt", "much", "must consist of numbers"),
+        ("limits.tilt", True, "must consist of numbers"),
         ("sim.wind", 3.0, "is three numbers"),
         ("sim.wind", (1.0, 2.0), "is three numbers"),
         ("sim.link", 1, "is a bool"),

@@ -44,8 +44,8 @@ class ClimbRateThrust:
 class CollectiveThrust:
     """The same field for PX4: collective thrust.
 
-    A proportional-integral loop, whose integral is an altitude error, holds the climb rate during one flight by
-    attitude. An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
+    During one attitude-controlled flight, a proportional-integral loop holds the climb rate; its integral is an
+    altitude error. An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -57,7 +57,7 @@ class CollectiveThrust:
         return climb_m_s
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
-        """Return the thrust field, 0 to 1, for a requested climb rate, positive up, the measured one, and a tilt."""
+        """Return the thrust field (0 to 1) for the requested and measured climb rates, positive up, and the tilt."""
         error = climb_m_s - climbing_m_s if climbing_m_s is not None else 0.0
         self._error_m += error * step_s
         self._error_m = max(-MOST_ALTITUDE_ERROR_M, min(MOST_ALTITUDE_ERROR_M, self._error_m))
@@ -68,14 +68,14 @@ class CollectiveThrust:
 
 ThrustModel = ClimbRateThrust | CollectiveThrust
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-REACHED_M: Final = 0.2  #: a take-off counts as complete this far below its target altitude
+REACHED_M: Final = 0.2  #: distance below its target altitude at which a take-off counts as complete
 EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position
 EKF_RELATIVE_PLACE: Final = 0x08
 EKF_CONSTANT: Final = 0x80  #: flag in the same messages: the position is only assumed to be constant
 EKF_UNINITIALISED: Final = 0x400
 THRUST_AS_THRUST: Final = 8  #: bit of ArduCopter's GUID_OPTIONS: the thrust field is collective thrust
 
-Values = Mapping[str, float]  #: the autopilot's parameters by the autopilot's own names
+Values = Mapping[str, float]  #: parameter values keyed by the autopilot's own names
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class AutopilotProfile(ABC):
     TAKING_OFF: ClassVar[frozenset[str]]
     NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that are flown with a remote control
     LEAD_S: ClassVar[float]  #: how long set-points must arrive before the vehicle enters GUIDED
-    BYTEWISE: ClassVar[bool]  #: whether writes encode integers bytewise, unless its capabilities say otherwise
+    BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if its capabilities do not say
     EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that it uses to convert latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
@@ -138,7 +138,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether a take-off is complete; ``rose``: it has been in the air since the take-off was accepted."""
+        """Return whether a take-off is complete; ``rose``: whether it has been airborne since accepting it."""
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
@@ -194,7 +194,7 @@ class ArduCopterProfile(AutopilotProfile):
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether the altitude has been reached, which is the only sign of a complete take-off."""
+        """Return whether the altitude has been reached, which is the only sign that a take-off is complete."""
         return rose and vehicle.altitude_m is not None and vehicle.altitude_m >= height_m - REACHED_M
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
@@ -290,14 +290,14 @@ class Px4Profile(AutopilotProfile):
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002
-        """Return whether the vehicle holds its position, which is what it does at the end of its take-off mode."""
+        """Return whether the vehicle holds its position, as it does once its take-off mode has ended."""
         return rose and vehicle.mode == self.HOLD and vehicle.landed is not Landed.TAKING_OFF
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
         """Return whether the vehicle can be armed; None while it does not report that.
 
         PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
-        allow arming, like one left over from a flight, the outcome does not apply to the mode in which a take-off
+        allow arming, such as one left over from a flight, the outcome does not apply to the mode in which a take-off
         begins. In that case only the position estimate is checked.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)

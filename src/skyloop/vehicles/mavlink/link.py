@@ -98,7 +98,7 @@ class UdpSender(UdpListener):
         super().__init__(Address(ConnectionKind.UDP_IN, "::" if family == socket.AF_INET6 else "", 0))
 
     def send(self, packet: Packet) -> None:
-        """Send a datagram to the peer, or to the configured address until something arrives."""
+        """Send a datagram to the packet's peer or, before one is known, to the configured address."""
         super().send(packet._replace(peer=packet.peer or self._to))
 
 
@@ -118,7 +118,7 @@ class _Stream(ByteStream):
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one at a time: even an open connection may have to wait."""
+    """A client of the autopilot's TCP server, which serves one client at a time: even an open connection may wait."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
@@ -141,11 +141,11 @@ _KINDS: Final[dict[ConnectionKind, type[MavlinkConnection]]] = {
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection to a host given as a number. Takes up to a second."""
+    """Open a connection to a host given by its numeric address. Takes up to a second."""
     return _KINDS[address.kind](address)
 
 
-WRITE_S: Final = 0.9  #: a write that is not confirmed within this time fails
+WRITE_S: Final = 0.9  #: time after which an unconfirmed write fails
 _CLOSE_S: Final = 3.0  #: time allowed for the thread to end
 
 
@@ -187,7 +187,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter; return why it failed, or None. Blocks for up to 0.9 s; not for the link's own thread."""
+        """Write a parameter; return why it failed, or None. Blocks up to 0.9 s: don't call it on the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()

@@ -23,16 +23,16 @@ POSITION: Final = 0xDF8
 POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
-ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitudes, whose heading turns with each repeat: 50 Hz
+ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitude set-points, each with a new heading in a turn: 50 Hz
 MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
-STOPPED_M_S: Final = 0.25  #: a vehicle slower than this holds its position instead of a speed of zero
-STOPPING_S: Final = 3.0  #: after this time, it holds its position in any case
-MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, if ticks paused
+STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
+STOPPING_S: Final = 3.0  #: time after which it holds its position in any case
+MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, used after a pause in the ticks
 WAY_M_S: Final = 1.0  #: default speed to a position
 WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
-WAY_M_S2: Final = 0.8  #: acceleration at the start and deceleration at the end of the way
-LEASH_S: Final = 1.5  #: how far the sent position may be ahead of the vehicle, as time at the requested speed
-LEASH_M: Final = 0.3  #: minimum of that distance
+WAY_M_S2: Final = 0.8  #: acceleration at the start, and deceleration at the end, of a flight to a position
+LEASH_S: Final = 1.5  #: maximum lead of the sent position over the vehicle, as flight time at the requested speed
+LEASH_M: Final = 0.3  #: minimum lead, as a distance
 
 Target = tuple[int, int]  #: system and component
 
@@ -87,7 +87,7 @@ class PositionSetpoint:
     """Flies straight to a position and stays there.
 
     Autopilots fly to a position as fast as their own parameters allow. The position sent therefore moves towards the
-    goal at the action's speed at most, and stays near the vehicle.
+    goal no faster than the action's speed, and stays near the vehicle.
     """
 
     period_ns = VELOCITY_PERIOD_NS
@@ -189,34 +189,34 @@ class AttitudeSetpoint:
 Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
-PATIENCE_NS: Final = nanoseconds(6.0)  #: give up a take-off not requested for this long if the vehicle is not armed
-RISING_NS: Final = nanoseconds(12.0)  #: give up if an armed vehicle is still on the ground by then; usual: 4.5 s
-ARM_PACE_S: Final = 1.0  #: between repeated commands to arm or take off
+PATIENCE_NS: Final = nanoseconds(6.0)  #: time without requests after which an unarmed take-off is given up
+RISING_NS: Final = nanoseconds(12.0)  #: time allowed for an armed vehicle to leave the ground; 4.5 s is usual
+ARM_PACE_S: Final = 1.0  #: time between repeated commands to arm or take off
 ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted without a confirming heartbeat
-LANDED_NS: Final = nanoseconds(2.5)  #: a landing that disarms the vehicle does so by then (PX4: after 2 s)
+LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
-LEFT_GROUND_M: Final = 0.3  #: climb that shows a lift-off if the vehicle does not report one
-CUT_SHORT: Final = 0.5  #: another operator stopped a take-off that holds below this fraction of its height
-CUT_SHORT_M: Final = 1.05  #: and at least this far below it: PX4 ends one NAV_MC_ALT_RAD (0.8 m) below its height
-STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported, because messages may be reordered
-STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long has been cancelled
+LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
+CUT_SHORT: Final = 0.5  #: fraction of its height below which a hold means that another operator stopped a take-off
+CUT_SHORT_M: Final = 1.05  #: minimum shortfall for that: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
+STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
+STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
 
 
 class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
     Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request,
-    ``disarms`` whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
+    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request;
+    ``disarms`` says whether the vehicle was found armed and our unfinished landing may still disarm it.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
-        self.given_up = ""  #: the reason, once given up
-        self.taken_over = False  #: another operator chose a mode in the air
-        self.declined = False  #: given up because another operator chose a mode before it was armed
-        self.rose = False  #: it has left the ground
+        self.given_up = ""  #: why the take-off was given up; empty if it was not
+        self.taken_over = False  #: whether another operator chose a mode in the air
+        self.declined = False  #: whether it was given up because another operator chose a mode before it was armed
+        self.rose = False  #: whether the vehicle has left the ground
         self.lead_ns: int | None = None  #: when set-points began to be sent
         self.reason = ""  #: the vehicle's own reason for refusing to arm
         self._autopilot = autopilot
@@ -235,8 +235,8 @@ class TakeoffSequence:
         self._seen = not autopilot.TAKING_OFF  # whether its take-off mode, if it has one, was seen
         self.refused = ""  #: why it is not armed yet
         self.arm_asked_ns: int | None = None  #: when arming was last requested; None if it was already armed
-        self._arming_ns: int | None = None  # the first arming request; earlier answers are to the landing's disarming
-        self._ready = False  # it was in the mode for taking off, to be armed or armed: another mode is others' choice
+        self._arming_ns: int | None = None  # first arming request; earlier replies belong to the landing's disarming
+        self._ready = False  # was in take-off mode, armed or about to be: any other mode is another operator's choice
 
     @property
     def started(self) -> bool:
@@ -278,7 +278,7 @@ class TakeoffSequence:
             if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
                 self.given_up = self.refused or "the vehicle does not answer"
             self._observe_mode(vehicle, cut_short=False, now_ns=now_ns)
-            if self.taken_over and not self.given_up:  # a pilot at the vehicle wants it otherwise: ask for nothing more
+            if self.taken_over and not self.given_up:  # another pilot has decided otherwise: request nothing more
                 self.taken_over, self.declined = False, True
                 self.given_up = f"it changed to {vehicle.mode}, which was not chosen here: take off again"
             return
@@ -303,7 +303,7 @@ class TakeoffSequence:
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
-            self.done = True  # as high as its reported altitude says it will get
+            self.done = True  # its reported altitude has stopped rising
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 
@@ -321,12 +321,12 @@ class TakeoffSequence:
         return height_m - self._ground_m > LEFT_GROUND_M
 
     def _is_cut_short(self, vehicle: VehicleState) -> bool:
-        """Return whether another operator chose position hold during the climb, which is also how take-offs end."""
+        """Return whether another operator chose position hold (in which take-offs also end) during the climb."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
         below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m
         if self._climb_command is not None and vehicle.amsl_m is not None:
-            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # its home may move during the climb
+            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # home may move during the climb
         return below_m is not None and below_m > max(CUT_SHORT * self._height_m, CUT_SHORT_M)
 
     def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:

@@ -20,7 +20,7 @@ from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_bet
 from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may have moved to another port
+MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
 MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
@@ -40,7 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Without a system id it selects the first one found and keeps to that system from then on.
+    Without a system id, it selects the first system found and keeps it from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -49,9 +49,9 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was, which may have moved there
-        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received at the same time
-        self._received_ns = 0  # when the chosen one was last received
+        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen one, which may have moved there
+        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, heard from at the same time
+        self._received_ns = 0  # when the chosen vehicle was last heard from
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
         """Handle a message; return events about other vehicles, or about the chosen one's move to another port."""
@@ -198,10 +198,10 @@ class CommandSender:
         return out
 
 
-AT_ONCE: Final = 4  #: maximum number of requests per tick, because a slow link needs room for other messages
+AT_ONCE: Final = 4  #: maximum number of requests per tick, to leave room for other messages on a slow link
 RETRY_S: Final = 3.0  #: time after which a message that arrives too slowly is requested again
 ENOUGH: Final = 0.5  #: fraction of the requested rate that is good enough
-PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, as the vehicle may not have the message
+PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, in case the vehicle does not have the message
 TRIES: Final = 4  #: number of requests at the shorter interval
 
 
@@ -213,7 +213,7 @@ class MessageIntervals:
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, the count then, number of requests
+        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at that time, number of requests
         self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
@@ -244,13 +244,13 @@ ASK_NS: Final = nanoseconds(1.0)  #: time between TIMESYNC requests
 HURRY_NS: Final = nanoseconds(0.1)  #: time between the first few requests
 FIRST: Final = 5  #: number of requests at the shorter interval
 KEEP_NS: Final = nanoseconds(10.0)  #: how long a clock sample is used
-PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that appears older than this on arrival is from another clock
-BEHIND_MS: Final = 1000  #: a stamp that goes back by more than this may mean that the vehicle rebooted
+PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: age on arrival above which a stamp is assumed to be from another clock
+BEHIND_MS: Final = 1000  #: backward jump of a stamp above which the vehicle may have rebooted
 _WRAP: Final = 1 << 32  #: stamps in ms wrap around at this value, after 49 days
 
 
 class VehicleClock:
-    """Converts a vehicle's stamps to this host's clock, by ``TIMESYNC`` if plausible, else by the smallest delay."""
+    """Converts a vehicle's stamps to this host's clock, using ``TIMESYNC`` if plausible or else the smallest delay."""
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None  #: round trip of the best recent reply
@@ -259,7 +259,7 @@ class VehicleClock:
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._watches: dict[str, RestartWatch] = {}  # by message name
+        self._watches: dict[str, RestartWatch] = {}  # keyed by message name
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
@@ -283,7 +283,7 @@ class VehicleClock:
         return []
 
     def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
-        """Classify a message by its stamp as new, overtaken by others of its kind, or sent after a reboot."""
+        """Classify a message by its stamp as new, older than others of its kind, or sent after a reboot."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
@@ -311,8 +311,8 @@ _NAN: Final = math.nan
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     """Convert an external pose to a message.
 
-    The message has north, east, down [m] and the angles of a body with forward, right and down axes [rad]. Its time is
-    in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
+    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. Its
+    time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)

@@ -128,7 +128,7 @@ class MavlinkOptions:
     parameters: bool = True  #: whether to read the autopilot's parameters
     key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
-    world_origin: tuple[float, float, float] | None = None  #: in the same units
+    world_origin: tuple[float, float, float] | None = None  #: the world origin's position, in the same units
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 
@@ -204,7 +204,7 @@ def _key(uri: VehicleUri) -> bytes | None:
         return held
     text = held.decode("ascii", "replace").strip()
     if not re.fullmatch(r"[0-9a-fA-F]{64}", text):
-        raise UsageError(f"{uri}: {given} holds no signing key: 32 bytes, or 64 hexadecimal digits")
+        raise UsageError(f"{uri}: {given} must contain a signing key: 32 bytes, or 64 hexadecimal digits")
     return bytes.fromhex(text)
 
 
@@ -241,7 +241,7 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
     if facing not in FACINGS:
         raise UnknownNameError("camera_facing of mavlink://", facing, FACINGS)
     if not 1 <= len(name) <= 64:
-        raise UsageError(f"{uri}: a camera's name has 1 to 64 characters")
+        raise UsageError(f"{uri}: a camera name must have 1 to 64 characters")
     return CameraOptions(
         source=source,
         name=name,

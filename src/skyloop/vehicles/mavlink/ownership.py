@@ -15,8 +15,8 @@ from skyloop.vehicles.mavlink.autopilots import AutopilotProfile
 from skyloop.vehicles.mavlink.manoeuvres import STRAYED_NS
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 
-LATE_NS: Final = nanoseconds(3.0)  #: longest delay with which a requested mode change may take effect
-PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a pause longer than this is a new decision, not a repeat
+LATE_NS: Final = nanoseconds(3.0)  #: longest delay before a requested mode change takes effect
+PAUSE_NS: Final = nanoseconds(0.5)  #: pause after which the same action is a new decision, not a repeat
 _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
@@ -24,7 +24,7 @@ class FlightOwnership:
     """Decides who is flying, based on the modes that the vehicle reports and those requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
-        self.left_to = ""  #: the mode, chosen elsewhere, that now flies the vehicle; empty if we do, or without a pilot
+        self.left_to = ""  #: foreign mode that now flies the vehicle; empty if we fly it or there is no pilot
         self._autopilot = autopilot
         self._by_itself = False  # its own failsafe chose the mode, so we may still hold or land the vehicle
         self._steering = False  # whether this program started or took over the flight
@@ -71,9 +71,9 @@ class FlightOwnership:
         self._repeated = None
 
     def take(self, action: AnyAction, vehicle: VehicleState | None, *, alone: bool, new: bool) -> None:
-        """Record that the vehicle is now under our control through this action.
+        """Record that this action puts the vehicle under our control.
 
-        ``alone``: a failsafe requested it while no pilot was in command; ``new``: an application newly requested it.
+        ``alone``: whether a failsafe requested it with no pilot in command; ``new``: whether an application just did.
         """
         begins = not self._steering or not isinstance(action, _SET_POINTS)
         if alone or (new and begins):

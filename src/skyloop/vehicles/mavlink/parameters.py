@@ -1,4 +1,4 @@
-"""Access to the autopilot's parameters over MAVLink, and their names under ``mavlink.`` with their types. Pure."""
+"""Access to the autopilot's parameters over MAVLink, and their types and names under ``mavlink.``. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-QUIET_NS: Final = nanoseconds(0.7)  #: silence after which missing parameters are requested
+QUIET_NS: Final = nanoseconds(0.7)  #: time without a new parameter after which missing ones are requested
 AT_ONCE: Final = 20  #: number of missing parameters requested at once
 LIST_NS: Final = nanoseconds(3.0)  #: time between requests for the list while nothing arrives
 GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
@@ -264,7 +264,7 @@ def check_exact(name: str, number: int, *, bytewise: bool) -> int:
     received = struct.unpack("<f", struct.pack("<f", number))[0]
     if received != number:
         raise ParameterError(
-            f"{name}: the vehicle carries whole numbers in single precision and would receive {received:.0f} "
+            f"{name}: the vehicle takes whole numbers in single precision and would receive {received:.0f} "
             f"instead of {number}: beyond ±{EXACT} only some can be written; use a ground station",
             code=Refusal.OUT_OF_RANGE,
         )
@@ -289,7 +289,7 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
     else:
         least, most = -math.inf, math.inf
         value, kind = rounded(held.value), ParameterType.FLOAT
-    # A value outside the range shows that the vehicle's own is wider.
+    # A value outside the range shows that the vehicle's own range is wider.
     low = _bound(min(meaning.low if meaning.low is not None else least, value))
     high = _bound(max(meaning.high if meaning.high is not None else most, value))
     text = meaning.text or f"the autopilot's {held.name}"

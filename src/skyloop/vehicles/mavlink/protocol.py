@@ -43,16 +43,16 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
 REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session, for heartbeats, requests and silence checks
 HEARTBEAT_NS: Final = nanoseconds(1.0)
-SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: longer than the 5 to 10 s after which the autopilots' failsafes act
-QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points are withheld: the vehicle might follow them late
-OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose no longer says where the vehicle is
-DEGRADED_NS: Final = nanoseconds(1.2)  #: silence after which the link is degraded
-LOST_NS: Final = nanoseconds(2.5)  #: silence after which the link is lost
-FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle that has sent no data by then is reported as lost
+SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: longer than the failsafes wait (5 to 10 s)
+QUIET_NS: Final = nanoseconds(0.5)  #: time without data until set-points are withheld: they might be followed late
+OLD_POSE_NS: Final = nanoseconds(0.5)  #: age beyond which a pose no longer says where the vehicle is
+DEGRADED_NS: Final = nanoseconds(1.2)  #: time without data after which the link counts as degraded
+LOST_NS: Final = nanoseconds(2.5)  #: time without data after which the link counts as lost
+FIRST_WORD_NS: Final = nanoseconds(2.5)  #: time without any data after which a vehicle is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: time allowed for the parameter list, after which the link is up without it
-WAKING_MS: Final = 60_000  #: a vehicle that booted less than this ago and can't be armed is still starting up
-IDENTITY_NS: Final = nanoseconds(2.0)  #: time allowed for a vehicle found again to prove that it is the same
-QUIET_ATTITUDE_S: Final = 0.5  #: if no attitude arrives for this long, other messages trigger feedback
+WAKING_MS: Final = 60_000  #: time since boot during which a vehicle that can't be armed is still starting up
+IDENTITY_NS: Final = nanoseconds(2.0)  #: time allowed for a rediscovered vehicle to prove that it is the same one
+QUIET_ATTITUDE_S: Final = 0.5  #: time without attitude messages after which other messages trigger feedback
 VERSION_PACE_S: Final = 1.0  #: time between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
@@ -105,8 +105,8 @@ class MavlinkSession(VehicleSession):
         self.parameters = ParameterExchange()
         self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
-        self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and if it is unknown
-        self.setpoints: SetpointController | None = None  #: None until then, and if the vehicle can't be flown
+        self.autopilot: AutopilotProfile | None = None  #: None until recognised, and if unknown
+        self.setpoints: SetpointController | None = None  #: None until the autopilot is known, and if it can't be flown
         self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own limits
         self.dropped = 0  #: number of packets that the connection dropped because its buffer was full
@@ -119,7 +119,7 @@ class MavlinkSession(VehicleSession):
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
         self._peer = options.peer  # the chosen vehicle's address, kept while the link is lost
-        self._slow_heartbeat = False  # lost while armed: regular heartbeats would keep its own failsafe from acting
+        self._slow_heartbeat = False  # True if lost while armed: regular heartbeats would hold off its own failsafe
         self._old = False  # whether the vehicle uses MAVLink 1
         self._signed = 0
         self._unencodable: set[str] = set()  # message types already reported as not encodable
@@ -130,7 +130,7 @@ class MavlinkSession(VehicleSession):
         self._waking = False  # whether it has just booted and can't be armed yet
         self._prearm = ""  # the latest reason that it gave for refusing to arm
         self._unsupported_reason = "no data from it"
-        #: Acts on any vehicle that answers, because an emergency stop must outlive the vehicle's state.
+        #: Acts on whichever vehicle answers, because an emergency stop must survive the loss of the vehicle's state.
         self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
@@ -154,14 +154,14 @@ class MavlinkSession(VehicleSession):
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
         """Accept an action; see :meth:`SetpointController.apply`. Also raises if the vehicle can't be flown."""
-        if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found any moment
+        if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found at any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
             return action
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # no effect, and on the ground pilots send it continuously
+            return action  # it has no effect, and pilots send it continuously on the ground
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
@@ -174,8 +174,8 @@ class MavlinkSession(VehicleSession):
     def pose_problem(self, captured_ns: int, now_ns: int) -> str:
         """Return why an external pose can't be sent now; empty if it can.
 
-        While the vehicle is silent, a pose might wait in a buffer and be taken for a new one when the vehicle resumes
-        reading, because an autopilot may date it by its arrival.
+        While the vehicle is silent, a pose might wait in a buffer. Once the vehicle resumes reading, an autopilot that
+        timestamps poses on arrival would mistake it for a new one.
         """
         if self._received_ns is None:
             return "no data from the vehicle: an external pose can't be sent until the link is up"
@@ -210,7 +210,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes from a peer, which are one datagram if ``whole``. Never raises, whatever the content."""
+        """Handle bytes from a peer; ``whole`` if they are one datagram. Never raises, whatever the content."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
@@ -243,7 +243,7 @@ class MavlinkSession(VehicleSession):
         if kind in _STAMPED:
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
             if arrival is Arrival.RESTARTED:
-                self.version = None  # another vehicle, with other parameters, may answer
+                self.version = None  # a different vehicle with other parameters may be answering
                 self.telemetry = Telemetry()
                 self._lose("the vehicle rebooted", now_ns)
             if arrival is not Arrival.NEW:
@@ -272,7 +272,7 @@ class MavlinkSession(VehicleSession):
             answers = self.clock.on_timesync(message, now_ns)
             if answers:
                 self._out += answers
-                self.due_ns = 0  # a late reply would shift the clock by which the vehicle dates external poses
+                self.due_ns = 0  # a late reply would shift the clock by which the vehicle timestamps external poses
         elif kind == "STATUSTEXT":
             for event in self._health.on_text(message, quiet=self._waking):
                 self._publish_event(event)
@@ -290,7 +290,7 @@ class MavlinkSession(VehicleSession):
             report = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
             if report != self._last_report:
                 self._last_report = report
-                self.due_ns = 0  # wake callers that wait for a mode
+                self.due_ns = 0  # wake callers that are waiting for a mode
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -446,7 +446,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None:
             self.setpoints.on_link_lost()
         self.clock = VehicleClock()
-        self._publish(self.clock.now(now_ns), now_ns)  # because its present state is unknown
+        self._publish(self.clock.now(now_ns), now_ns)  # report that its present state is unknown
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
@@ -497,7 +497,7 @@ class MavlinkSession(VehicleSession):
             self._publish_event(event_of(limits_text(self.limits), "limits"))
 
     def _on_version(self, version: Message, now_ns: int) -> None:
-        """Handle the vehicle's version. A vehicle found again counts as the same only if its version proves that."""
+        """Handle the vehicle's version. A rediscovered vehicle counts as the same only if its version proves it."""
         before, self._known_as, self.version = self._known_as, None, version
         same = True if before is None else _is_same(before, version)
         heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
@@ -516,7 +516,7 @@ class MavlinkSession(VehicleSession):
             self.parameters.request_all(now_ns)
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle has replied to something."""
+        """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle replies to a request."""
         super().broken(error, now_ns)
         self._receives_us = False
 

@@ -1,8 +1,8 @@
-"""Turning the last action into the messages due at each tick. Pure.
+"""Turn the last action into the messages due at each tick. Pure.
 
-Set-points are streamed while a pilot is at the controls, and only in the mode that follows them. A failsafe, a lost
-link or another operator's mode change (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream, after which
-only the vehicle's own safety nets fly it.
+Set-points are streamed only while a pilot is at the controls and the vehicle is in the mode that follows them. A
+failsafe, a lost link or another operator's mode change (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the
+stream, after which only the vehicle's own safety nets fly it.
 """
 
 from __future__ import annotations
@@ -51,27 +51,27 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
-SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off at its height counts as complete by then, whatever the mode
+SETTLING_NS: Final = nanoseconds(3.0)  #: time at its height after which a take-off counts as complete in any mode
 DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after the vehicle was last seen armed
-IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground disarms itself within this time
-STEP_NS: Final = nanoseconds(0.04)  #: time between the steps of a take-off or landing that only wait for time to pass
+IDLES_NS: Final = nanoseconds(12.0)  #: time within which an autopilot left armed on the ground disarms itself
+STEP_NS: Final = nanoseconds(0.04)  #: time between steps of a take-off or landing while they only wait
 HURRY_NS: Final = nanoseconds(0.008)  #: minimum time between a new set-point and the previous one
 
 
 class Goal(Enum):
     """The vehicle's task."""
 
-    NOTHING = auto()  #: none from us: the vehicle is left to itself and to other operators
+    NOTHING = auto()  #: no goal of ours: the vehicle is left to itself and to other operators
     TAKE_OFF = auto()
     FOLLOW = auto()  #: follow streamed set-points, including hovering
-    HOLD = auto()  #: hold position without a stream
+    HOLD = auto()  #: hold position without streaming set-points
     LAND = auto()
 
 
 class SetpointController:
     """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
-    ``make_thrust`` creates the thrust model for a flight by attitude; ``stop`` may be active already.
+    ``make_thrust`` creates the thrust model for an attitude-controlled flight; ``stop`` may be active already.
     """
 
     def __init__(
@@ -98,8 +98,8 @@ class SetpointController:
         self._strayed_ns: int | None = None  # when the vehicle left the required mode again
         self._settling_ns: int | None = None  # when a take-off reached its height and began to wait for the next mode
         self._stepped_ns = 0  # time of the last step; 0 if there was none
-        self._arms_until_ns: int | None = None  # until then, a take-off aborted by a landing may arm the vehicle
-        self._disarms_until_ns = 0  # until then, a failed or interrupted take-off may arm the vehicle
+        self._arms_until_ns: int | None = None  # time until which a take-off aborted by a landing may arm the vehicle
+        self._disarms_until_ns = 0  # time until which a failed or interrupted take-off may arm the vehicle
         self._blind_until_ns = 0
         self._repeats_refused = ""  # why repeats of a take-off are refused
         self._events: list[VehicleEvent] = []
@@ -112,9 +112,9 @@ class SetpointController:
         """Accept an action; return the action in force, which is idle if it is ignored.
 
         While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused
-        and all other actions are ignored. ``alone``: a failsafe requested it while no pilot was in command; ``new``: an
-        application newly requested it, so that it is none of the library's repeats. Raises :class:`DriverError` if the
-        action is not possible now, or another operator has the vehicle.
+        and all other actions are ignored. ``alone``: whether a failsafe requested it while no pilot was in command;
+        ``new``: whether an application just requested it, as opposed to a repeat by the library. Raises
+        :class:`DriverError` if the action is not possible now, or another operator is flying the vehicle.
         """
         if isinstance(action, Idle):
             return action
@@ -138,7 +138,7 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns, new=new)
         elif isinstance(action, Land):
-            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats don't undo others' mode
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats respect foreign modes
                 self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
@@ -199,7 +199,7 @@ class SetpointController:
             if self.goal is not Goal.LAND:  # a landing keeps disarming a vehicle that is armed or may soon be
                 self._end()
         elif alone or vehicle is None or (vehicle.airborne is None and self.goal is not Goal.FOLLOW):
-            self._end()  # on the ground, a set-point would start some vehicles
+            self._end()  # a set-point would start some vehicles on the ground
             self.goal = Goal.HOLD
         elif self.goal is not Goal.FOLLOW or not isinstance(self._setpoint, PositionHold):
             self._follow(PositionHold(now_ns))
@@ -210,7 +210,7 @@ class SetpointController:
         if vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
             return Idle()  # a set-point would cancel a take-off
         if vehicle.airborne is None and self.goal is not Goal.FOLLOW:
-            return Idle()  # on the ground, a set-point would start some vehicles
+            return Idle()  # a set-point would start some vehicles on the ground
         if isinstance(action, Velocity):
             if isinstance(self._setpoint, VelocitySetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.action = action
@@ -219,7 +219,7 @@ class SetpointController:
         elif isinstance(action, Position):
             if isinstance(self._setpoint, PositionSetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.replace(action)
-                return action  # no hurry, because the position sent moves step by step
+                return action  # not urgent, because the position sent moves step by step
             self._follow(PositionSetpoint(action))
         else:
             if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
@@ -313,9 +313,8 @@ class SetpointController:
     def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
         """Return the set-points that are due, and pass commands to the command sender.
 
-        ``read`` says whether the vehicle seems to read commands promptly, judging by its messages. If not, a set-point
-        might wait in a buffer and be followed late, so instead of a changed velocity only a stop is sent, which is
-        harmless even if late.
+        ``read`` says whether the vehicle seems to read commands promptly, judging by its messages. If not, a changed
+        velocity might wait in a buffer and take effect late, so only a stop is sent, which is harmless even then.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
@@ -370,8 +369,8 @@ class SetpointController:
     def step_blind(self, now_ns: int) -> bool:
         """Send a new hover or landing while nothing is being received; return whether a command is in progress.
 
-        The vehicle may still receive it. A failsafe's requests are not sent in this way, because by now another
-        operator may be flying the vehicle without our knowing.
+        The vehicle may still receive the command. A failsafe's requests are not sent in this way, because by now
+        another operator may be flying the vehicle without our knowing.
         """
         modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
         if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
@@ -380,7 +379,7 @@ class SetpointController:
         return True
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when :meth:`messages` will next have something to send; None if that is not determined."""
+        """Return when :meth:`messages` will next have something to send; None if unknown."""
         if self.stop.active:
             return None if self.stop.shown else now_ns
         if self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
@@ -448,7 +447,7 @@ class SetpointController:
         self._commands.request(self._autopilot.mode_command(mode), now_ns)
 
     def _strayed(self, mode: str, inside: bool, now_ns: int) -> bool:
-        """Return whether the vehicle has been out of the required mode again for longer than :data:`STRAYED_NS`.
+        """Return whether the vehicle left the required mode again more than :data:`STRAYED_NS` ago.
 
         A mode that may be the delayed effect of our own command does not count.
         """
@@ -461,7 +460,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle in a mode chosen elsewhere; return whether we may still hold or land it."""
+        """Leave the vehicle in a foreign mode; return whether we may still hold or land it."""
         why = "its own failsafe" if vehicle.failsafe else "not chosen here"
         self._notify(f"the vehicle changed to {vehicle.mode} ({why}): no more set-points are sent", reason="mode")
         self._end()
@@ -476,7 +475,7 @@ class SetpointController:
             return []
         self._ask_for(self._autopilot.HOLD, now_ns)
         if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
-            self._sent_ns = now_ns  # until the mode is reported, or in case it is refused
+            self._sent_ns = now_ns  # stop it until the mode is reported, or if the mode is refused
             return [velocity_message(Velocity(), self._commands.target)]
         return []
 

@@ -16,12 +16,12 @@ from skyloop.messages.geometry import turned
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message, ModeFlag, SystemState, Texts
 
-FLOWING_S: Final = 1.0  #: attitude, position and velocity older than this count as unknown
+FLOWING_S: Final = 1.0  #: age above which attitude, position and velocity count as unknown
 SLOW_S: Final = 6.0  #: corresponding limit for slow messages such as battery and GPS
 LANDED_S: Final = 3.0  #: corresponding limit for the landed state
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-AIRBORNE_M: Final = 0.5  #: a vehicle that does not report whether it is flying counts as flying above this height
+AIRBORNE_M: Final = 0.5  #: height above which a vehicle that does not report whether it is flying counts as flying
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,21 +33,21 @@ class VehicleState:
     status: int  #: MAV_STATE from the heartbeat
     landed: Landed
     ready: bool | None  #: whether it can be armed; None if unknown
-    position: Vector | None  #: position from its origin [m]
+    position: Vector | None  #: position relative to its origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
     altitude_m: float | None  #: height above its start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: whether it reports that it receives a remote control
-    heartbeat_ns: int = 0  #: when its newest heartbeat, which says whether it is armed, arrived
+    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which says whether it is armed
     reports_landed: bool = False  #: whether it has ever reported whether it is on the ground
 
     @property
     def airborne(self) -> bool | None:
         """Whether it is off the ground under its own power; None if unknown.
 
-        An armed vehicle may be flying if it reports neither that nor its height, for example when it has just been
-        found again, or if it is low and its own report is late.
+        An armed vehicle may be flying if it reports neither flight nor height, for example just after being found
+        again, or if it is low and its own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
@@ -67,10 +67,10 @@ class Telemetry:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered current instance
-        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # for messages with several instances
+        self._newest: dict[str, tuple[Message, int]] = {}  # by kind, from the lowest-numbered current instance
+        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # by kind and number, where there are several
         self._ground_down: float | None = None  # how far the ground is below the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same place on Earth
+        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; and that place on Earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Store a message from the selected vehicle."""
@@ -164,9 +164,9 @@ class Telemetry:
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix or either position.
+        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix and both positions.
 
-        Without a fix, an autopilot's origin may be arbitrary, as for motion capture.
+        Without a fix, an autopilot's origin may be arbitrary, as with motion capture.
         """
         gps = self.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is None or gps.fix_type < GOOD_FIX or self._on_earth is None:
@@ -318,7 +318,7 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
 
 def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
     status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
-    # Use the lowest-numbered battery, and no other even if it falls silent, because their charges differ.
+    # Always use the lowest-numbered battery, even if it stops reporting, because batteries differ in charge.
     batteries = telemetry.instances("BATTERY_STATUS", now_ns)
     first = next((each for each in batteries if each.battery_function not in _OTHERS), None)
     if first not in telemetry.instances("BATTERY_STATUS", now_ns, SLOW_S):
@@ -364,11 +364,11 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed after lift-off for a report from the air (PX4 sends one per second)
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until it is reported airborne (PX4: once per second)
 
 
 class HealthMonitor:
-    """Reports each change in the vehicle's health once, and the vehicle's own texts."""
+    """Reports each change in the vehicle's health once, and passes on the vehicle's own texts."""
 
     def __init__(self) -> None:
         self._texts = Texts()

@@ -35,8 +35,8 @@ LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition
 MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
 USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode needs
 _ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
-LONG_DELAY_S: Final = 2.0  #: a failsafe that starts later than this causes a warning
-CURVED_API: Final = (1, 46)  #: since this version (Betaflight 4.5), the lean for a stick follows the curve of its rates
+LONG_DELAY_S: Final = 2.0  #: delay of a failsafe above which a warning is given
+CURVED_API: Final = (1, 46)  #: API version (Betaflight 4.5) from which a stick's tilt follows its rate curve
 _PROCEDURES: Final = {
     BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
     INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
@@ -53,7 +53,7 @@ class Setup:
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
-    sticks_known: bool = False  #: whether those positions were reported and are not a guess
+    sticks_known: bool = False  #: whether those positions were reported rather than assumed
     rx: msp.RxConfig = field(default_factory=msp.RxConfig)
     failsafe: msp.FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
@@ -103,7 +103,7 @@ class Setup:
     def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
         """Return AUX channels [µs] that activate the required modes and as few others as possible.
 
-        ``given`` has the channels set by the user, counted from 0, except for the arm switch.
+        ``given`` contains the channels set by the user, counted from 0, except for the arm switch.
         """
         wanted = {self.number(ANGLE)}
         if arm:
@@ -141,7 +141,7 @@ class Setup:
 
     @property
     def full_tilt_rad(self) -> float | None:
-        """Return the lean at full stick; None if unknown."""
+        """Return the tilt at full stick; None if unknown."""
         return None if self.angle_limit_deg is None else math.radians(self.angle_limit_deg)
 
     def tilt_curves(self) -> tuple[Curve, Curve]:
@@ -257,7 +257,7 @@ _INAV_TUNING: Final = 7  # number of bytes in RC_TUNING up to the yaw rate
 _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
-Read = Callable[[Setup, bytes], dict[str, Any]]  #: the settings that a reply changes; raises DecodeError
+Read = Callable[[Setup, bytes], dict[str, Any]]  #: returns the settings that a reply changes, or raises DecodeError
 
 
 class Identification:
@@ -300,7 +300,7 @@ class Identification:
             self._questions.ask(Function.COMMON_SETTING, self._on_last, b"max_angle_inclination_rll\0")
 
     def _ask(self, function: Function, read: Read, needed: str = "", payload: bytes = b"") -> None:
-        """Request settings; ``needed`` names those without which no sticks can be sent."""
+        """Request settings; ``needed`` describes any that must be read before sticks can be sent."""
 
         def on_reply(reply: bytes | None) -> None:
             if reply is not None:

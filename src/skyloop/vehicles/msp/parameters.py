@@ -59,7 +59,7 @@ def options_of(uri: VehicleUri) -> MspOptions:
     return MspOptions(*found, rate_hz=rate, override=override)
 
 
-AUTOMATIC: Final = 0  #: value of an AUX channel that is to be set as the modes require
+AUTOMATIC: Final = 0  #: AUX channel value meaning that the driver sets it to suit the modes
 _LIMITS: Final = (
     ("tilt", 0.02, 1.0, "rad", "maximum roll and pitch together, up to a full stick"),
     ("climb", 0.05, 10.0, "m/s", "maximum climb and descent"),
@@ -87,7 +87,7 @@ class _Entry:
 
 
 class DriverParameters:
-    """The driver's own parameters. The caller must hold the lock that protects the controller that uses them."""
+    """The driver's own parameters. The caller must hold the lock of the controller that uses them."""
 
     def __init__(self, setpoints: SetpointController) -> None:
         self._setpoints = setpoints

@@ -30,16 +30,16 @@ from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
-DEGRADED_NS: Final = nanoseconds(0.4)  #: silence after which the link is degraded
-LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is lost
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller that has not replied by then is reported as lost
+DEGRADED_NS: Final = nanoseconds(0.4)  #: time without data after which the link counts as degraded
+LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link counts as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time without a reply after which a flight controller is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
 MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an unacknowledged frame older than this is lost once a newer reply arrives
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: age at which an unacknowledged frame is lost if a newer reply has arrived
 LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
-UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, it arms only once the arm switch has been off
-LEAST_STICKS_HZ: Final = 25.0  #: a lower rate causes a warning
+UNTOLD_NS: Final = nanoseconds(0.5)  #: time without sticks after which it arms only once the arm switch has been off
+LEAST_STICKS_HZ: Final = 25.0  #: rate below which a warning is given
 BUNDLING_API: Final = (1, 42)  #: Betaflight's API version that introduced MULTIPLE
 _MODES_AT: Final = 6  # offset of the modes in STATUS
 WAKING_NS: Final = nanoseconds(8.0)  #: longest time after power-on in which temporary conditions prevent arming
@@ -75,9 +75,9 @@ class MspSession(VehicleSession):
         self._known = False  # whether identification has been completed since it was found
         self._refused_variant = ""
         self._unread = ""  # settings that were not reported
-        self._part = Setup()  # the settings read so far, which allow a stop
-        self._armed: bool | None = None  # as reported before the settings were read; None if not reported
-        self._stop_waits = False  # whether a stop waits until it is known whether it is armed
+        self._part = Setup()  # the settings read so far, which suffice for a stop
+        self._armed: bool | None = None  # the state reported before the settings were read; None if not reported
+        self._stop_waits = False  # whether a stop is waiting for the armed state to be known
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
         self._sticks: deque[int] = deque()  # when each unacknowledged frame was sent
@@ -85,7 +85,7 @@ class MspSession(VehicleSession):
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
-        self._wakes_until_ns: int | None = None  # None if its state is unknown; 0 if it has been ready
+        self._wakes_until_ns: int | None = None  # None if its state is unknown; 0 once it has been ready
         self._woke = False  # whether it was still starting up at the last check
         self._may_steer = False  # whether its state is known, so that our sticks won't disarm it in flight
         self._armed_throttle: float | None = None
@@ -115,7 +115,7 @@ class MspSession(VehicleSession):
     def final_bytes(self, now_ns: int) -> bytes:
         """Return the final bytes to send before the connection closes, which disarm a vehicle on the ground.
 
-        A flying vehicle is sent nothing: its failsafe is configured to handle the silence that follows.
+        Nothing is sent to a flying vehicle: its failsafe is configured to handle the loss of the receiver.
         """
         if not self._may_steer or self.options.override or self.setpoints.phase is Phase.FLYING:
             return b""
@@ -208,7 +208,7 @@ class MspSession(VehicleSession):
         overridden = self.setup.is_active(status.modes, *MSP_OVERRIDE)
         if not self._may_steer:
             if armed and not self.options.override and self._armed_throttle is None:
-                return  # a flying vehicle must not be sent anything until its throttle is known
+                return  # nothing may be sent to a flying vehicle until its throttle is known
             self._may_steer = True
             if armed and self._armed_throttle is not None and not self.options.override:
                 self.setpoints.report = Report(armed, names, overridden)
@@ -335,7 +335,7 @@ class MspSession(VehicleSession):
         return now_ns - self._opened_ns >= UNTOLD_NS
 
     def _holds_back(self, now_ns: int) -> bool:
-        """Return whether to withhold sticks, which might wait in a buffer and be obeyed late, or be another pilot's.
+        """Return whether to withhold sticks, which might wait in a buffer and act late, or override another pilot.
 
         A paused flight controller resumes as if no time had passed and obeys everything that arrived during the pause;
         only its replies show that it is reading. Until the link is lost, a few frames are sent anyway, to hold off the
@@ -355,7 +355,7 @@ class MspSession(VehicleSession):
         setpoints = self.setpoints
         active, urgent = setpoints.stop.active, setpoints.step_stop(now_ns)
         if active and not setpoints.stop.active and not setpoints.receiving:
-            # Adopt a vehicle that is found flying again, rather than disarm it by an old stop.
+            # Adopt a vehicle that turns out to be flying again instead of disarming it because of an old stop.
             self._may_steer, self._armed_throttle = False, None
             setpoints.report = Report()
         return urgent
@@ -436,7 +436,7 @@ class MspSession(VehicleSession):
         self._telemetry = Telemetry(streams, bundle)
 
     def _keep_part(self) -> None:
-        """Keep the settings read so far or in an earlier attempt, which at least allow a stop."""
+        """Keep settings read so far or in an earlier attempt, so that at least a stop is possible."""
         if self.setup is not None or self._identification is None:
             return
         found, before = self._identification.setup, self._part
@@ -452,7 +452,7 @@ class MspSession(VehicleSession):
     def _lose(self, reason: str, now_ns: int) -> None:
         """Start identifying it again while polling its state, so that control of a flying vehicle soon resumes.
 
-        It is sent :data:`LAST_STICKS` final frames, then only requests and stops, so that its own failsafe acts.
+        After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that its own failsafe acts.
         """
         del now_ns
         self._keep_part()

@@ -1,4 +1,4 @@
-"""Turning set-points into sticks: arming, holding a climb rate, touch-down and disarming. Pure.
+"""Turn set-points into sticks: arming, holding a climb rate, touch-down and disarming. Pure.
 
 The hover throttle is learnt: during take-off the throttle rises slowly until the vehicle lifts off, and from then on a
 slow integral corrects the value.
@@ -27,10 +27,10 @@ OFF_US: Final = 1000
 SPOOL_PER_S: Final = 0.15  #: rate at which the throttle rises during take-off, fraction of full throttle per second
 SPOOL_FROM: Final = 0.6  #: fraction of the hover throttle, if known, at which the rise begins
 IDLE: Final = 0.05  #: throttle at which the rise begins if the hover throttle is unknown
-ARM_NS: Final = nanoseconds(6.0)  #: arming has failed if not confirmed by then; Betaflight's BOOTGRACE is 5 s
+ARM_NS: Final = nanoseconds(6.0)  #: time allowed for arming to be confirmed; Betaflight's BOOTGRACE is 5 s
 NAMED_NS: Final = nanoseconds(0.4)  #: how long a reported obstacle to arming must last to count as a refusal
 REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
-ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has not started by then
+ASKED_NS: Final = nanoseconds(1.0)  #: time after which a requested take-off that has not started expires
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
 #: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
 PASSING: Final = frozenset(
@@ -46,25 +46,25 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     )
 )
-SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: more of them, in its first reports before it has an attitude
-LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] at a lift-off, by precision
-LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off, by precision
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until it has an attitude
+LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precision
+LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off
 OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the one at lift-off
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a descent stalled this long has met the ground
-HEADWAY: Final = 0.4  #: a descent slower than this fraction of the requested one is stalled
-STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means in the air, by whether it is precise
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: stall time that counts as a touch-down
+HEADWAY: Final = 0.4  #: fraction of the requested rate below which a descent counts as stalled
+STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which it is airborne, by precision
 #: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
-#: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but still shows sinking at 0.15 m/s.
+#: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but a descent at 0.15 m/s remains visible.
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction while it seems to be on the ground, fraction per second
-#: Fraction of the hover throttle below which a vehicle that seems to stand is on the ground, keyed by whether it is
-#: more than HIGH_M above the ground it left. If it is still airborne there, it falls at the lower throttle, which shows
-#: even if its motion is measured too slow, as in a simulated world that lags behind the firmware's clock.
+#: Fraction of the hover throttle below which a vehicle that seems motionless counts as landed, keyed by whether it is
+#: more than HIGH_M above the ground it left. If it is still airborne, it falls at the lower throttle, fast enough to be
+#: noticed even if its motion is measured too slow, as in a simulated world that lags behind the firmware's clock.
 OFF_BELOW: Final = {False: 0.6, True: 0.15}
 HIGH_M: Final = 0.5
-BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
-BLIND_NS: Final = nanoseconds(6.0)  #: it is disarmed if the climb is unknown for this long
-MOST_LEARNT: Final = 0.9  #: greatest hover throttle that is learnt
+BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown: it sinks
+BLIND_NS: Final = nanoseconds(6.0)  #: time with an unknown climb rate after which it is disarmed
+MOST_LEARNT: Final = 0.9  #: upper limit of the learnt hover throttle
 LEAST_LEARNT: Final = 0.05
 LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
 #: Reason given for not restarting a vehicle that did not confirm a stop.
@@ -110,14 +110,14 @@ class Report:
 class SetpointController:
     """Stores the last set-point and turns it into receiver channels.
 
-    With ``override`` a pilot keeps a real receiver, and only the pilot arms.
+    With ``override``, a pilot keeps a real receiver, and nobody else can arm the vehicle.
     """
 
     def __init__(self, override: bool = False) -> None:
         self.limits = Limits()
         self.gains = Gains()
         self.given_aux: dict[int, int] = {}
-        self.full_tilt_rad: float | None = None  #: lean at full stick, if set by the user
+        self.full_tilt_rad: float | None = None  #: tilt at full stick [rad], if set by the user
         self.hover: float | None = None  #: hover throttle, 0 to 1; None until it has been learnt
         self.report = Report()
         self.phase = Phase.STANDING
@@ -139,7 +139,7 @@ class SetpointController:
         self._refused: tuple[str, int] | None = None
         self._abort_ns: int | None = None
         self._still_ns: int | None = None
-        self._smooth_climb = self._smooth_wanted = 0.0  # the measured and the requested climb, with the same delay
+        self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested climb, filtered with the same delay
         self._smooth_height = 0.0
         self._blind_ns: int | None = None
         self._sink = 1.0
@@ -161,7 +161,7 @@ class SetpointController:
 
     @property
     def full_tilt(self) -> float:
-        """The lean at full stick [rad]."""
+        """The tilt at full stick [rad]."""
         return self.full_tilt_rad or self._setup.full_tilt_rad or math.radians(45.0)
 
     @property
@@ -206,9 +206,9 @@ class SetpointController:
             yaw_rate=clamped(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
-            self._enter(Phase.STANDING, now_ns)  # no longer requested, so it must not arm as soon as it can
+            self._enter(Phase.STANDING, now_ns)  # the take-off is no longer requested, so it must not arm later
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
-            self._start(now_ns)  # only a requested take-off, and no other set-point, lifts a vehicle off the ground
+            self._start(now_ns)  # takes off only if a take-off was requested, not for any other set-point
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
@@ -236,7 +236,7 @@ class SetpointController:
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start a take-off; if that is certain to fail, don't, and return why."""
+        """Let the next climb start a take-off, unless that is certain to fail; return why it would fail."""
         why = self.why_not(now_ns)
         self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
         return why
@@ -279,7 +279,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                if heard:  # a take-off in progress must not arm it again; after a loss there is none
+                if heard:  # a take-off in progress must not arm it again; after a link loss, there is none
                     self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
@@ -411,7 +411,7 @@ class SetpointController:
             self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
 
     def _lifted(self, climb: float, height: float, step_s: float) -> bool:
-        """Return whether it has left the ground. Precise motion is smoothed so that noise can't pass for a lift-off."""
+        """Return whether it has left the ground. Precise motion is smoothed so that noise is not taken for one."""
         if self._motion.precise:
             self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
             self._smooth_height = height = _smoothed(self._smooth_height, height, step_s)

@@ -29,8 +29,8 @@ from skyloop.vehicles.msp.wire.messages import (
     multiple,
 )
 
-PATIENCE_NS: Final = nanoseconds(0.5)  #: a reply that has not arrived by then counts as lost
-TRIES: Final = 3  #: maximum number of requests per question
+PATIENCE_NS: Final = nanoseconds(0.5)  #: time after which a missing reply counts as lost
+TRIES: Final = 3  #: maximum number of attempts per request
 
 #: Called with the reply's payload; None if the function is unknown or there was no reply.
 Handler = Callable[[bytes | None], None]
@@ -106,7 +106,7 @@ class Telemetry:
     """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
-    in its buffers, and so would the sticks behind them: at most ``most`` are unanswered. A reply to ``MULTIPLE``, which
+    in its buffers and delay the sticks behind them, so at most ``most`` are unanswered. A reply to ``MULTIPLE``, which
     newer firmware supports, does not say what it contains, so there is only one ``bundle``, requested at the rate of
     its first function: if a reply is lost, the next one can't be mistaken for it.
     """
@@ -166,12 +166,12 @@ class Telemetry:
 
 Vector = tuple[float, float, float]
 
-POSE_NS: Final = nanoseconds(0.25)  #: a pose older than this is not used
-ALTITUDE_NS: Final = nanoseconds(0.5)  #: a barometer altitude older than this is not used
-GPS_NS: Final = nanoseconds(1.0)  #: a fix older than this is not used
-GAP_NS: Final = nanoseconds(0.4)  #: a gap between poses longer than this restarts the velocity filter
+POSE_NS: Final = nanoseconds(0.25)  #: maximum age of a pose that is used
+ALTITUDE_NS: Final = nanoseconds(0.5)  #: maximum age of a barometer altitude that is used
+GPS_NS: Final = nanoseconds(1.0)  #: maximum age of a GPS fix that is used
+GAP_NS: Final = nanoseconds(0.4)  #: gap between poses above which the velocity filter restarts
 SMOOTH_S: Final = 0.05  #: time constant of the velocity computed from poses
-LEAST_SATELLITES: Final = 5  #: a fix with fewer satellites is not used
+LEAST_SATELLITES: Final = 5  #: minimum number of satellites of a fix that is used
 GROUND_SAMPLES: Final = 10  #: approximate number of samples over which the ground's height is averaged
 EARTH_RADIUS_M: Final = 6_371_000.0
 
@@ -263,7 +263,7 @@ class MotionEstimate:
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the ground's height while at rest; a single sample may be off by more than the height of a lift-off."""
+        """Learn the ground's height while at rest; one sample's error may exceed the height of a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])

@@ -30,8 +30,8 @@ DISCOVERY_VARIABLES: Final = (
 PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
 _OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
 _FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS 3
-MOST_DOMAIN: Final = 101  #: for higher domains, DDS's ports may be taken by outgoing connections on Linux
-SHARED_BYTES: Final = 16 * 2**20  #: a participant's shared memory, for several images; the default 512 KiB holds none
+MOST_DOMAIN: Final = 101  #: maximum domain: above it, outgoing connections on Linux may occupy DDS's ports
+SHARED_BYTES: Final = 16 * 2**20  #: shared memory per participant: several images; the default 512 KiB is too small
 
 #: A profile for Fast DDS: sockets only on loopback, and shared memory with room for images.
 LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -84,7 +84,7 @@ def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
         return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])
     if environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # for other DDS implementations
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # setting for other DDS implementations
         return True
     folder = tempfile.TemporaryDirectory(prefix="skyloop-ros-")
     atexit.register(folder.cleanup)
@@ -110,7 +110,7 @@ def domain_of(text: str | None) -> int | None:
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):
-        raise UsageError(f"the domain of ROS 2 is {text!r} and must be a number from 0 to {MOST_DOMAIN}")
+        raise UsageError(f"the ROS 2 domain is {text!r} but must be a number from 0 to {MOST_DOMAIN}")
     return int(text)
 
 

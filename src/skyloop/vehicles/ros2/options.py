@@ -33,7 +33,7 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 class Options:
     """Full names of a robot's topics and services, empty for those that it lacks, and the other options."""
 
-    namespace: str  #: with a leading slash
+    namespace: str  #: namespace with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
     info: str  #: ``sensor_msgs/CameraInfo``
     cmd_vel: str  #: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``
@@ -49,7 +49,7 @@ class Options:
     compressed: bool  #: whether images are JPEG
     stamped: bool  #: whether velocities have a stamp
     ground: bool  #: whether it is a ground vehicle, for which take-off and landing start and end the drive
-    timeout_s: float  #: silence after which the link is lost [s]
+    timeout_s: float  #: time without data after which the link counts as lost [s]
     domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
@@ -82,12 +82,12 @@ def options_of(uri: VehicleUri) -> Options:
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):
-        raise UsageError(f"{uri}: {uri.place!r} is not a namespace of ROS 2: letters, digits and _, no digit first")
+        raise UsageError(f"{uri}: {uri.place!r} is not a ROS 2 namespace: letters, digits and _, no digit first")
 
     def name(option: str, default: str = "") -> str:
         given = uri.options.get(option, default)
         if given and not _NAME.match(given):
-            raise UsageError(f"{uri}: option {option} is {given!r} and must be a name of ROS 2, or empty for none")
+            raise UsageError(f"{uri}: option {option} is {given!r} but must be a ROS 2 name, or empty for none")
         return given if given.startswith("/") or not given else f"{namespace}/{given}"
 
     topics = {option: name(option, default) for option, default in TOPICS.items()}
@@ -101,7 +101,7 @@ def options_of(uri: VehicleUri) -> Options:
             raise UsageError(f"{uri}: option {option} makes no sense: {reason}")
     camera = uri.options.get("camera", "front")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", camera):
-        raise UsageError(f"{uri}: option camera is {camera!r} and must be a name of 1 to 32 letters, digits, _ or -")
+        raise UsageError(f"{uri}: option camera is {camera!r} but must be a name of 1 to 32 letters, digits, _ or -")
     mount = uri.options.get("mount", "ahead")
     if mount not in MOUNTS:
         raise UnknownNameError(f"mount of a camera of {uri.scheme}://", mount, MOUNTS)

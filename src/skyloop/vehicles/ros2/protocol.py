@@ -1,6 +1,6 @@
 """A robot as a vehicle: messages become samples for the proxy's sink, actions become velocities and service calls.
 
-This module does not need rclpy: a message is any object with the right fields, and a function calls services.
+This module does not need rclpy: any object with the right fields is a message, and a function calls services.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class RobotSession:
         self._velocity: Velocity | None = None  # velocity in force
         self._commanded_ns = 0  # when the velocity was commanded
         self._pending: _Pending | None = None
-        self._up: bool | None = False if options.ground else None  # whether it flies or drives, by the services
+        self._up: bool | None = False if options.ground else None  # whether it flies or drives, judging by the services
         self._refused = ""  # why a take-off was refused
         self._warned: set[str] = set()
 
@@ -154,7 +154,7 @@ class RobotSession:
         """Accept an action that is among the capabilities.
 
         A repeated take-off or landing (not ``new``) does not call the service again. Raises :class:`DriverError` if the
-        robot does not offer the service, is silent when asked to take off, or has already refused this take-off.
+        robot does not offer the service, sends no data before a take-off, or has already refused this take-off.
         """
         with self._lock:
             if isinstance(action, Velocity):
@@ -263,7 +263,7 @@ class RobotSession:
         self._velocity, self._pending = None, pending
 
     def _fail_pending(self) -> None:
-        """Drop the pending action, and stop after a landing: a robot without watchdog would keep its last velocity."""
+        """Drop the pending action, and stop after a landing: without a watchdog, a robot keeps its last velocity."""
         if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
             self._velocity = Velocity()
         self._pending = None
@@ -330,7 +330,7 @@ def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
     return data, size
 
 
-PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older than this or in the future is from another clock
+PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: age above which a stamp is from another clock, as are future stamps
 
 
 class CaptureClock:

@@ -1,8 +1,8 @@
 """Conversions between the values in ROS 2 messages and Skyloop's. Pure.
 
 Both use the same axes (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical axes x
-right, y down, z forward. They differ in this: Skyloop's velocity is in the body's *levelled* axes, a twist is in body
-axes; ROS 2 uses quaternions for angles, and a covariance of -1 or NaN for unknown values.
+right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's is in body
+axes; ROS 2 expresses angles as quaternions, and marks unknown values with a covariance of -1 or with NaN.
 
 A ``tf2_msgs/msg/TFMessage`` is built as bytes, because its package can be installed only with a ROS 2 distribution. The
 format is OMG's Common Data Representation, version 1, little-endian, as in DDS: a four-byte header, then the fields in
@@ -27,7 +27,7 @@ from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler
 
 Quaternion = tuple[float, float, float, float]  #: x, y, z, w
 
-NOT_KNOWN: Final = -1.0  #: first number of the covariance of something not measured (sensor_msgs/Imu)
+NOT_KNOWN: Final = -1.0  #: first covariance element of a quantity that was not measured (sensor_msgs/Imu)
 #: Variance reported where none was measured, meaning "about right" rather than "exact" [m², (m/s)², rad² …].
 VARIANCE: Final = 0.01
 
@@ -83,7 +83,7 @@ class ClockMap:
 
 
 def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
-    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or all but zero."""
+    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or is almost zero."""
     length = math.sqrt(sum(each * each for each in quaternion))
     if not (math.isfinite(length) and length > 1e-6):
         return None
@@ -139,7 +139,7 @@ def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` as first number."""
+    """Return a covariance matrix row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` as first element."""
     found = [0.0] * (size * size)
     if not known:
         found[0] = NOT_KNOWN

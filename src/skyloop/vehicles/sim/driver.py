@@ -191,7 +191,7 @@ class SimDriver(Driver):
         return [*table.describe(self._present(), self._standard()), *surroundings, *firmware]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter; raise an error for an unknown name or an invalid value. The wind is the whole world's."""
+        """Write a parameter; raise an error for an unknown name or an invalid value. Wind affects the whole world."""
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
         with self._changing:
@@ -242,7 +242,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio on or off. Like real drones, one without reception holds its position."""
+        """Switch the simulated radio on or off. Like a real drone, it holds its position without reception."""
         sink = self._sink
         if sink is None:
             return
@@ -306,8 +306,8 @@ class SimDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
 
 
-LIFT_M_S: Final = 0.05  #: a set-point that climbs faster than this starts the motors
-DOWN_M: Final = 0.08  #: below this height, a descending drone counts as landed
+LIFT_M_S: Final = 0.05  #: climb rate of a set-point above which the motors start
+DOWN_M: Final = 0.08  #: height below which a descending drone counts as landed
 
 
 class SetpointController:
@@ -333,7 +333,7 @@ class SetpointController:
         return action if applied is None else applied
 
     def on_feedback(self, believed: VehicleFeedback) -> None:
-        """Start or stop the motors as the set-point in force requires in the newest reported state."""
+        """Start or stop the motors as required by the set-point in force and the newest reported state."""
         with self._lock:
             if self._setpoint is not None:
                 self._follow(believed.state, believed)

@@ -46,8 +46,8 @@ _NAMES: Final = {
 }
 _ERRORS: Final = (FirmwareEventKind.SILENT, FirmwareEventKind.DIED, FirmwareEventKind.FAILED)
 _KEPT_REPORTS: Final = 64  # number of reports kept, to find the truth at the time of delayed feedback
-_POSE_STD_M: Final = 0.001  # standard deviation that is stated for the true position
-#: Greatest age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
+_POSE_STD_M: Final = 0.001  # standard deviation reported for the true position
+#: Maximum age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
 #: time, so is the firmware's clock; its driver trusts that clock and would report a greater age.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
@@ -204,7 +204,7 @@ class FirmwareFlight:
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback with the true state at the same time, as far as it is known yet."""
+        """Return the firmware's feedback with the true state at the same time, if already known."""
         reports = tuple(self._reports)
         if not reports:
             return feedback

@@ -29,7 +29,7 @@ AUTOPILOT_VEHICLES: Final = {
 }
 #: Firmware on the computer's clock can't catch up: world time would fall behind, and images would appear old.
 REAL_TIME_LAG_S: Final = 0.02  #: lag beyond which steps are skipped with such firmware
-TRUTH_HZ: Final = 100.0  #: rate at which the truth that accompanies the firmware's state is stored
+TRUTH_HZ: Final = 100.0  #: rate at which the ground truth is stored alongside the firmware's state
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
@@ -47,7 +47,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
     if vehicle not in VEHICLES:
         raise UnknownNameError("simulated vehicle", vehicle, VEHICLES)
     if autopilot is not None and VEHICLES[vehicle].rotors is None:
-        raise UsageError(f"{uri}: firmware needs a vehicle with rotors, such as vehicle=iris: not {vehicle}")
+        raise UsageError(f"{uri}: firmware needs a vehicle with rotors, such as vehicle=iris, not {vehicle}")
     speed = uri.number("speed", 1.0, minimum=0.01, maximum=100.0)
     if autopilot is AutopilotKind.BETAFLIGHT and speed != 1.0:
         raise UsageError(f"{uri}: Betaflight uses the computer's clock: speed must be 1, not {speed:g}")
@@ -90,7 +90,7 @@ def _autopilot(uri: VehicleUri) -> AutopilotKind | None:
         raise UnknownNameError("autopilot of sim://", given, known)
     for name in ("native", "velocity"):
         if name in uri.options:
-            raise UsageError(f"{uri}: {name} is an option of the built-in autopilot, and {given} flies: leave it out")
+            raise UsageError(f"{uri}: {name} is an option of the built-in autopilot, but {given} flies: remove it")
     return AutopilotKind(given)
 
 
@@ -127,7 +127,7 @@ def _native(text: str | None) -> frozenset[str]:
     for name in names - EVERY_ACTION:
         raise UnknownNameError("action", name, EVERY_ACTION)
     if not names & {"velocity", "attitude"}:
-        raise UsageError(f"native={text} leaves no set-point: add velocity or attitude")
+        raise UsageError(f"native={text} contains no set-point: add velocity or attitude")
     if ("takeoff" in names) != ("land" in names):
         raise UsageError(f"native={text}: takeoff and land go together")
     return frozenset(names) | ALWAYS_NATIVE

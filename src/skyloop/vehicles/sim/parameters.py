@@ -24,7 +24,7 @@ _LIMITS: Final = (
     ("limits.speed", "speed_m_s", "m/s", "greatest horizontal speed of a velocity set-point"),
     ("limits.takeoff_altitude", "takeoff_altitude_m", "m", "where a take-off ends"),
 )
-#: Each camera parameter's last part of the name, field in :class:`CameraModel`, unit, range and description.
+#: For each camera parameter: last part of the name, field in :class:`CameraModel`, unit, range and description.
 _CAMERA: Final = (
     ("fps", "fps", "1/s", (0.1, 240.0), "pictures a second of simulated time"),
     ("latency", "latency_s", "s", (0.0, 5.0), "from exposure to delivery"),
@@ -35,7 +35,7 @@ _CAMERA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterValues:
-    """The values of one drone's parameters. Limits are None if its firmware has its own."""
+    """The values of one drone's parameters. Limits are None if the firmware has its own limits."""
 
     limits: Limits | None
     cameras: tuple[CameraModel, ...]
@@ -155,7 +155,7 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
     ]
 
 
-#: Function that lists each group's parameters, by the first part of their names.
+#: Functions that list the parameters of a group, keyed by the first part of their names.
 _GROUPS: Final = {"limits": _limit_entries, "camera": _camera_entries, "sim": _world_entries}
 
 
@@ -174,10 +174,10 @@ def _checked(parameter: Parameter, value: Value) -> Value:
     written: list[float] = []
     for number in numbers:
         if isinstance(number, bool) or not isinstance(number, (int, float)):
-            raise ParameterError(f"{name} is made of numbers, not {value!r}", code=Refusal.WRONG_TYPE)
+            raise ParameterError(f"{name} must consist of numbers, not {value!r}", code=Refusal.WRONG_TYPE)
         if not (parameter.minimum or 0.0) <= number <= (parameter.maximum or 0.0):
             raise ParameterError(
-                f"{name} is from {parameter.minimum:g} to {parameter.maximum:g}, not {number!r}",
+                f"{name} must be from {parameter.minimum:g} to {parameter.maximum:g}, not {number!r}",
                 code=Refusal.OUT_OF_RANGE,
             )
         written.append(float(number))

@@ -14,7 +14,7 @@ from skyloop.sim.world import Vec3
 
 
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
-    """Convert a report to feedback; the options say whether it has the position, the velocity and the truth.
+    """Convert a report to feedback; the options select whether it includes position, velocity and truth.
 
     ``state`` is the flight state to report, which is less detailed for a vehicle that flies by set-points alone.
     """
@@ -61,7 +61,7 @@ def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
 def truth_at(reports: Sequence[Report], captured_ns: int) -> Report:
     """Return a report for the given time, interpolating the drone's true motion between the two nearest reports.
 
-    ``reports`` must be sorted and not empty; for times outside its range, the first or last report is returned.
+    ``reports`` must be sorted and not empty; for times outside their range, the first or last report is returned.
     """
     after = bisect_right(reports, captured_ns, key=lambda report: report.captured_ns)
     if after == 0:

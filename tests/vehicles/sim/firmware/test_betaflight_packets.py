@@ -64,7 +64,7 @@ def test_any_input_is_a_packet_or_refused(data: bytes) -> None:
 
 
 def test_refusals_give_the_reason() -> None:
-    with pytest.raises(DecodeError, match="3 bytes, where the motors of Betaflight have 16"):
+    with pytest.raises(DecodeError, match="a Betaflight motor packet has 16 bytes, got 3"):
         decode_motors(b"abc")
     with pytest.raises(DecodeError, match="not finite"):
         decode_motors(struct.pack("<4f", 0, 0, math.nan, 0))

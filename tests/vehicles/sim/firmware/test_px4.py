@@ -123,7 +123,7 @@ def test_its_death_stops_the_rotors_and_it_is_restarted(rig: Rig) -> None:
 
 def test_a_program_without_its_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "px4")))
-    with pytest.raises(UsageError, match=r"SKYLOOP_PX4 must be bin/px4 of a whole build"):
+    with pytest.raises(UsageError, match=r"SKYLOOP_PX4 must be bin/px4 of a complete build"):
         Px4(print).start()
 
 

@@ -1,4 +1,4 @@
-"""An emulated ArduCopter or PX4 on the network, flying a simulated vehicle, for any MAVLink program.
+"""An emulated ArduCopter or PX4 that flies a simulated vehicle and is open to any MAVLink program.
 
 To use it on free local ports, as in a test::
 
@@ -55,7 +55,7 @@ _KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px
 
 
 class RunningFirmware(RunningEmulator):
-    """An autopilot that is switched on. Belongs to the loop's thread."""
+    """An autopilot that is switched on. Use it only on the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
         super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
@@ -142,9 +142,9 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
     ) -> None:
         number = drone + 1 if system is None else system
         if not 1 <= number <= 255:
-            raise UsageError(f"a system id is from 1 to 255, not {number!r}")
+            raise UsageError(f"a system id must be from 1 to 255, not {number!r}")
         if version not in (1, 2):
-            raise UsageError(f"the MAVLink version is 1 or 2, not {version!r}")
+            raise UsageError(f"the MAVLink version must be 1 or 2, not {version!r}")
         super().__init__(host, drone)
         self._loop = loop
         delay_s = checked_delay(delay_s)
@@ -158,7 +158,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def autopilot(self) -> Autopilot:
-        """The running autopilot, for tests. Belongs to the loop's thread."""
+        """The running autopilot, for tests. Use it only on the loop's thread."""
         return self._started.autopilot
 
     @property

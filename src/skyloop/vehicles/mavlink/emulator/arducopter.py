@@ -31,12 +31,12 @@ from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
-STICK_TIMEOUT_S: Final = 3.0  #: a remote control over MAVLink counts as lost after this much silence
+STICK_TIMEOUT_S: Final = 3.0  #: time without input after which a remote control over MAVLink counts as lost
 STICK_SPEED_M_S: Final = 6.0  #: speed at full stick
 TURN_RAD_S: Final = math.radians(60)  #: maximum turn rate of CONDITION_YAW
 RTL_LOWEST_M: Final = 0.3  #: lowest altitude above home for a return
 RTL_LEAST_SLOPE: Final = 0.5  #: flatter RTL cones are ignored
-_GUIDED_ITEM: Final = 2  #: value of "current" in a mission item that is a position to fly to now
+_GUIDED_ITEM: Final = 2  #: value of "current" in a mission item that means "fly there now"
 _ALTITUDE_ITEM: Final = 3
 CHANNELS: Final = 16
 _OVERRIDDEN: Final = 8  #: number of channels that an override can set
@@ -49,7 +49,7 @@ class ArduCopter(Autopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT
-    CAPABILITIES = 0xFBEF & ~0xD200  # without fences, rally points, terrain and files, which are not emulated
+    CAPABILITIES = 0xFBEF & ~0xD200  # excluding fences, rally points, terrain and files, which are not emulated
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
     FRAMES = frozenset({WORLD, WORLD_OFFSET, BODY, BODY_OFFSET})
@@ -132,7 +132,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without MAVLink input, the simulated one applies, with its throttle stick down."""
+        """Follow the remote control. Without MAVLink input, a simulated one with its throttle down applies."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:
@@ -253,7 +253,7 @@ class ArduCopter(Autopilot):
             made = self._finite(self._from_here(message)) if message.coordinate_frame in self.FRAMES else None
         self._target, self._target_s, self._turn = made, self.time_s, None
         if not (isinstance(made, Target) and made.place is None and made.velocity is None):
-            self._rising = False  # even during a take-off
+            self._rising = False  # this also ends a take-off
 
     @staticmethod
     def _finite(target: Target | None) -> Target | None:
@@ -262,7 +262,7 @@ class ArduCopter(Autopilot):
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target with a position relative to the vehicle, which is the case for all frames but one."""
+        """Return a target with a position relative to the vehicle, as in all frames but one."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target
@@ -272,7 +272,7 @@ class ArduCopter(Autopilot):
         east, north, up = (at + by for at, by in zip(self.flight.place, place, strict=True))
         return replace(target, place=(east, north, up))
 
-    # Places and speeds by command ------------------------------------------------------------------------------
+    # Position and speed commands -------------------------------------------------------------------------------
 
     def _go_to(self, target: Target) -> None:
         self._target, self._target_s, self._turn, self._rising = target, self.time_s, None, False
@@ -335,7 +335,7 @@ class ArduCopter(Autopilot):
         self._paused = not order
         return Result.ACCEPTED
 
-    def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  it has none
+    def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  the command has none
         major, minor = self.VERSION >> 24, self.VERSION >> 16 & 0xFF
         for text in (f"ArduCopter V{major}.{minor}.0-dev (emulated by Skyloop)", "Frame: QUAD/X"):
             self.send_text(text, INFO)

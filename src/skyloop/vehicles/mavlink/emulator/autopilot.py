@@ -1,4 +1,4 @@
-"""Behaviour shared by both autopilots, which fly a simulated vehicle by messages. Pure except for the vehicle.
+"""Behaviour shared by both autopilots, which fly a simulated vehicle on command. Pure except for the vehicle.
 
 Times are on the autopilot's clock in simulated seconds, so that everything runs faster in a faster world.
 """
@@ -28,7 +28,7 @@ CRITICAL: Final = 2
 INFO: Final = 6
 AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until it disarms
 _GCS: Final = 6  #: MAV_TYPE of a ground station
-#: Messages that the old request for all messages does not affect.
+#: Messages unaffected by the old request for messages.
 _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_HEARTBEAT,
     m.MAVLINK_MSG_ID_TIMESYNC,
@@ -53,7 +53,7 @@ class Result(IntEnum):
 
 
 class Autopilot(AutopilotState):
-    """One autopilot. All methods belong to one thread. Set ``ports`` (its links) before the first report."""
+    """One autopilot. Call all its methods on one thread. Set ``ports`` (its links) before the first report."""
 
     CAPABILITIES: ClassVar[int]
     VERSION: ClassVar[int]
@@ -65,7 +65,7 @@ class Autopilot(AutopilotState):
     NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
     DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
-    WORDS: ClassVar[dict[str, str]]  #: its texts when it is armed, disarmed, auto_disarm (on the ground) or landed
+    WORDS: ClassVar[dict[str, str]]  #: texts for being armed, disarmed, auto_disarm (on the ground) and landed
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, boot_s, gps)
@@ -96,7 +96,7 @@ class Autopilot(AutopilotState):
             m.MAV_CMD_DO_SET_HOME: self._set_home,
         }
 
-    # Time passes -----------------------------------------------------------------------------------------------
+    # Simulation steps ------------------------------------------------------------------------------------------
 
     def tick(self, report: Report) -> None:
         """Handle a new report: fly, and send the messages that are due."""
@@ -115,7 +115,7 @@ class Autopilot(AutopilotState):
 
     @abstractmethod
     def _fly(self) -> None:
-        """Fly according to the mode. Called in every tick while armed."""
+        """Fly according to the mode. Called on every tick while armed."""
 
     def _check_ground(self) -> None:
         if not self.flight.standing:
@@ -163,7 +163,7 @@ class Autopilot(AutopilotState):
         for port in self.ports:
             port.send(MAKERS[m.MAVLINK_MSG_ID_HEARTBEAT](self))
 
-    # Messages come -----------------------------------------------------------------------------------------------
+    # Incoming messages -------------------------------------------------------------------------------------------
 
     def on_message(self, port: Port, message: Message, now_ns: int) -> None:
         """Handle a message and send replies to its port. All messages before the first report are ignored."""
@@ -202,7 +202,7 @@ class Autopilot(AutopilotState):
                 port.send(answer)
 
     def _restart(self) -> None:
-        """Boot again, as if switched on now."""
+        """Boot again, as if just switched on."""
         self._begun_s = self._gcs_s = None
         self.home, self._home_given = (0.0, 0.0, 0.0), False
         self._pose_s, self._posing_s = -math.inf, math.inf
@@ -231,7 +231,7 @@ class Autopilot(AutopilotState):
         self._pose_s = self.time_s
 
     def _data_stream(self, port: Port, message: Message) -> None:
-        """Handle the old message request, which sets one rate for all messages."""
+        """Handle the old request for messages, which sets a single rate for all of them."""
         rate = min(50, message.req_message_rate) if message.start_stop else 0
         for number in MAKERS:
             if number not in _ON_REQUEST:
@@ -333,7 +333,7 @@ class Autopilot(AutopilotState):
         """Return the result code of a refusal to disarm in flight."""
 
     def _datum(self, frame: int) -> float | None:
-        """Return the height above the flight's origin of a frame's altitude 0 [m]; None for an unknown frame."""
+        """Return the height [m] above the flight's origin where a frame's altitude is 0; None for an unknown frame."""
         if frame in self.ABOVE_SEA:
             return -ORIGIN.altitude_m
         return self.home[2] if frame in self.ABOVE_HOME else None

@@ -44,9 +44,9 @@ class Ports:
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports numbered from a base, which increases by 10 with each drone: its UDP port, the remote one, TCP.
+        """Return ports numbered from a base, which increases by 10 per drone: UDP port, remote UDP port, TCP port.
 
-        The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` beyond port 65535.
+        The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` for ports above 65535.
         """
         if base is None:
             return cls.standard(kind, drone)
@@ -112,7 +112,7 @@ class Settings:
         return self.version == 2 or message.id < 256
 
 
-MAX_INTERVAL_US: Final = 2**31 - 1  #: greatest value of the interval field in ``MESSAGE_INTERVAL``
+MAX_INTERVAL_US: Final = 2**31 - 1  #: maximum value of the interval field in ``MESSAGE_INTERVAL``
 
 
 class Streams:
@@ -161,7 +161,7 @@ class Streams:
 OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
-PEER_NS: Final = nanoseconds(3.0)  #: a peer that has been silent for this long may be replaced by another
+PEER_NS: Final = nanoseconds(3.0)  #: time without data after which a peer may be replaced by another
 
 
 class Port(Protocol):

@@ -61,7 +61,7 @@ class Target:
     yaw_rate: float = 0.0
 
     def follow(self, flight: FlightControl, speeds: Speeds = USUAL, turn: float | None = None) -> None:
-        """Fly to the target, with ``turn`` as the yaw rate [rad/s] if given. Called in every tick."""
+        """Fly to the target, with ``turn`` as the yaw rate [rad/s] if given. Called on every tick."""
         if turn is None:
             turn = self.yaw_rate if self.yaw is None else flight.yaw_rate_to(self.yaw)
         if self.velocity is not None and self.place is None:
@@ -90,7 +90,7 @@ def target_of(message: Message) -> Target:
 def global_target_of(message: Message, datum: float | None) -> Target | None:
     """Return the target from ``SET_POSITION_TARGET_GLOBAL_INT``; None for an invalid position or frame.
 
-    ``datum`` is the height above our origin of the frame's altitude 0 [m].
+    ``datum`` is the height [m] above our origin at which the frame's altitude is 0.
     """
     mask, place = message.type_mask, None
     if not mask & _POSITION:
@@ -138,7 +138,7 @@ def attitude_target_of(message: Message) -> AttitudeTarget:
     )
 
 
-_THERE_M: Final = 0.3  #: a return's waypoint closer than this counts as reached
+_THERE_M: Final = 0.3  #: distance within which a return's waypoint counts as reached
 
 
 class _Leg(Enum):
@@ -160,14 +160,14 @@ class _Return:
 
 
 class Turn:
-    """A turn by an angle from the present heading [rad]: positive counter-clockwise, maybe more than half a turn."""
+    """A turn by an angle from the present heading [rad]: positive counter-clockwise, may exceed half a turn."""
 
     def __init__(self, flight: FlightControl, angle: float, fastest: float) -> None:
         self._flyer, self._fastest = flight, fastest
         self._left, self._yaw = angle, flight.yaw
 
     def rate(self) -> float:
-        """Return the present yaw rate [rad/s]. Called in every tick."""
+        """Return the present yaw rate [rad/s]. Called on every tick."""
         self._left -= wrap_angle(self._flyer.yaw - self._yaw)
         self._yaw = self._flyer.yaw
         return clamped(YAW_GAIN_PER_S * self._left, self._fastest)
@@ -186,7 +186,7 @@ class Manoeuvres:
         self._rise_m = height_m
 
     def rise(self) -> bool:
-        """Take off and climb; return whether the height has been reached. Called in every tick."""
+        """Take off and climb; return whether the height has been reached. Called on every tick."""
         flight = self._flyer
         if self._rise_m is None:
             return True
@@ -205,7 +205,7 @@ class Manoeuvres:
         self._return = _Return(self._flyer.place, home, min(height_m, self._flyer.highest_m), wait_s, final_m)
 
     def return_home(self, speeds: Speeds = USUAL) -> None:
-        """Continue the return. Called in every tick."""
+        """Continue the return. Called on every tick."""
         flight, way = self._flyer, self._return
         if way is None or flight.standing:
             return
@@ -234,7 +234,7 @@ class Manoeuvres:
         speeds: Speeds = USUAL,
         turn: float | None = None,
     ) -> None:
-        """Follow a set-point, or hold position if there is none; ``lean`` flies an attitude. Called in every tick."""
+        """Follow a set-point (an attitude with ``lean``), or hold position if there is none. Called on every tick."""
         if isinstance(target, Target):
             target.follow(self._flyer, speeds, turn)
         elif target is not None:

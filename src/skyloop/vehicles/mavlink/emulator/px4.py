@@ -38,7 +38,7 @@ class Px4(Autopilot):
     """An emulated PX4."""
 
     AUTOPILOT = Number.PX4
-    CAPABILITIES = 0xE8FF & ~0xC025  # without files, missions, fences and rally points, which are not emulated
+    CAPABILITIES = 0xE8FF & ~0xC025  # excluding files, missions, fences and rally points, which are not emulated
     VERSION = 1 << 24 | 17 << 16
     RATES: ClassVar[dict[int, float]] = {
         m.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -80,7 +80,7 @@ class Px4(Autopilot):
         self.mode = "AUTO.LOITER"
         self._intended = self.mode  # the mode that the user chose, which failsafes don't change
         self._before = self.mode  # the mode in use before a manoeuvre
-        self._waiting_at: Target | None = None  # the position where HOLD is to wait
+        self._waiting_at: Target | None = None  # position at which HOLD is to wait
         self._speeds = USUAL
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
@@ -88,7 +88,7 @@ class Px4(Autopilot):
         self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up and left turn, each 1 at full stick
         self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # filtered speed of each stick [1/s]
         self._stick_s = -math.inf
-        self._lost_stick_s: float | None = None  # when the remote control in use went silent
+        self._lost_stick_s: float | None = None  # when the remote control in use was lost
 
     @property
     def custom_mode(self) -> int:
@@ -99,7 +99,7 @@ class Px4(Autopilot):
         """Whether it can be armed in its present mode."""
         return self.mode != "OFFBOARD" or self._fresh
 
-    def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
+    def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  every ground station counts
         return True
 
     @property
@@ -141,7 +141,7 @@ class Px4(Autopilot):
             self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
         elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost:
-            self.failsafe = False  # recovered, because the user had chosen this mode
+            self.failsafe = False  # recovered: the user had chosen this mode
             self._enter("OFFBOARD")
 
     @property
@@ -235,7 +235,7 @@ class Px4(Autopilot):
         return Result.TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
-        """Take off, whether or not the vehicle is armed, and on the ground or in the air."""
+        """Take off from the ground or in the air, whether or not the vehicle is armed."""
         amsl = arguments[6]
         above = self.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
         height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
@@ -269,9 +269,9 @@ class Px4(Autopilot):
         self.set_points += 1
         self._target, self._target_s = made, self.time_s
 
-    # Places and speeds by command ------------------------------------------------------------------------------
+    # Position and speed commands -------------------------------------------------------------------------------
 
-    def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
+    def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  always above sea level
         """Enter HOLD at another position. While disarmed, this changes only the mode."""
         if whole(arguments[1]) != 1:
             return Result.UNSUPPORTED
@@ -297,7 +297,7 @@ class Px4(Autopilot):
         self._waiting_at = Target((east, north, up), yaw=yaw)
         return Result.ACCEPTED
 
-    def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
+    def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  always above sea level
         if arguments[0] > 0.5:
             place = self.flight.place
         elif not all(map(math.isfinite, arguments[4:7])):
@@ -329,12 +329,12 @@ class Px4(Autopilot):
             return
         throttle = 2 * message.z - 1000
         ways = (message.x, -message.y, throttle, -message.r)
-        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # beyond: no axis
+        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # larger: no axis
         stick = (forward, left, up, turn)
         since_s = self.time_s - self._stick_s
         if not self.remote:
             self._stick_moves = (0.0, 0.0, 0.0, 0.0)
-        elif since_s == 0.0:  # two in one step: wait for the next one to see how far the stick moved
+        elif since_s == 0.0:  # two messages in one step: wait for the next one to see how far the stick moved
             return
         else:
             share = since_s / (since_s + STICK_FILTER_S)
@@ -363,7 +363,7 @@ class Px4(Autopilot):
         self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
 
     def _check_sticks(self) -> None:
-        """In any mode, hold and then return once a remote control that was in use has gone silent."""
+        """In any mode, hold and then return once a remote control that was in use is lost."""
         if self.remote:
             if self._lost_stick_s is not None:  # the remote control came back before the return began
                 self.failsafe, self._lost_stick_s = False, None

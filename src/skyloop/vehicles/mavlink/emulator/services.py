@@ -132,12 +132,12 @@ def answers(message: Message) -> Iterable[Message]:
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "MISSION_REQUEST_LIST":
         yield m.MAVLink_mission_count_message(*sender, 0, message.mission_type)
-    elif kind == "MISSION_COUNT":  # an upload; an empty one does not clear anything
+    elif kind == "MISSION_COUNT":  # an upload; an empty upload clears nothing
         yield mission_ack(message, MissionResult.UNSUPPORTED if message.count else MissionResult.ACCEPTED)
     elif kind == "MISSION_CLEAR_ALL":
         yield mission_ack(message, MissionResult.ACCEPTED)
     elif kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ITEM", "MISSION_ITEM_INT"):
-        yield mission_ack(message, MissionResult.ERROR)  # an item that was not requested
+        yield mission_ack(message, MissionResult.ERROR)  # the item was not requested
     elif kind == "LOG_REQUEST_LIST":
         yield m.MAVLink_log_entry_message(0, 0, 0, 0, 0)
     elif kind == "FILE_TRANSFER_PROTOCOL":
@@ -231,7 +231,7 @@ class ParameterTable:
             yield self._value(message.param_id)
 
     def pending(self, port: Port) -> list[Message]:
-        """Return the part of a list that is to be sent now."""
+        """Return the part of a list to send now."""
         waiting = self._lists.get(port)
         if not waiting:
             return []

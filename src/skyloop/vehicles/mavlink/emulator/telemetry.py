@@ -1,4 +1,4 @@
-"""An autopilot's state by the simulation's reports, and the MAVLink messages made from it, by number. Pure."""
+"""An autopilot's state as reported by the simulation, and the MAVLink messages made from it, by number. Pure."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PREARM: Final = 0x10000000
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
-#: Estimator flags for a known position: relative and absolute, now and predicted for the air. DroneKit waits for the
-#: last one.
+#: Estimator flags for a known position: relative and absolute, each current and predicted for flight. DroneKit waits
+#: for the last one.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
-POSES_S: Final = 1.0  #: without GPS, how long external poses must arrive before the position is known
+POSES_S: Final = 1.0  #: how long external poses must arrive before the position is known without GPS
 POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
 _COPIES: Final = 1 << 32
 _LANDED: Final = {

@@ -2,7 +2,7 @@
 
 Pure except for the wall clock in signatures. The float field in ``PARAM_VALUE`` and ``PARAM_SET`` can hold an integer
 in two ways: ArduPilot converts it to a float; PX4 stores its bytes. ``PARAM_ENCODE_BYTEWISE`` in
-``AUTOPILOT_VERSION.capabilities`` says which.
+``AUTOPILOT_VERSION.capabilities`` tells the two apart.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _AROUND_V2: Final = 12  #: bytes in a MAVLink 2 frame's header and checksum
 _SIGNATURE: Final = 13  #: bytes in a signature
 _LEAST: Final = _AROUND_V1
 _MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
-_MOST_SOURCES: Final = 16  #: maximum number of senders whose incomplete frames are kept, as anybody can send datagrams
-_SIGNED: Final = 1  #: the flag, among those that a receiver must understand, that marks a signed frame
+_MOST_SOURCES: Final = 16  #: maximum number of senders whose incomplete frames are kept: anybody can send datagrams
+_SIGNED: Final = 1  #: incompatibility flag that marks a signed frame
 _SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, from which signature time counts in steps of 10 µs
 _STEPS_PER_S: Final = 100_000
-_OLD: Final = 60 * _STEPS_PER_S  #: how far a new sender's time may be behind
+_OLD: Final = 60 * _STEPS_PER_S  #: how far a new sender's timestamp may lag behind
 _UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: accepted without a signature: radios have no key
 _HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, sequence number, system, component, type
-_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, then as above, with a three-byte type
+_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, then as above but with a three-byte type
 
 
 class _Kind(NamedTuple):
@@ -97,13 +97,13 @@ def _decode_plain(data: bytes) -> Message | None:
     attributes.update(kind.common)
     attributes.update(zip(kind.fields, kind.unpack(data[begin:end].ljust(kind.size, b"\0")[: kind.size]), strict=True))
     message._msgbuf, message._crc = bytearray(data), checksum
-    message._payload = message._msgbuf[_HEADER_V1.size : end]  # as in pymavlink, for both versions
+    message._payload = message._msgbuf[_HEADER_V1.size : end]  # pymavlink does this for both versions
     message._header = dialect.MAVLink_header(number, incompatible, compatible, length, sequence, system, component)
     return message
 
 
 def _length_of(data: bytes) -> int | None:
-    """Return the length of the frame with which the data starts; None if there is none or too few bytes to tell."""
+    """Return the length of the frame at the start of the data; None if there is none or too little data to tell."""
     if len(data) < _LEAST or data[0] not in _MARKERS:
         return None
     if data[0] == dialect.PROTOCOL_MARKER_V1:
@@ -192,11 +192,11 @@ class Codec:
         if not whole:
             return self._parsed(data)
         rest = self._rests.pop(source, b"")
-        if _length_of(data) == len(data):  # true for nearly every datagram, which saves searching for frame boundaries
+        if _length_of(data) == len(data):  # usually true, so that no search for frame boundaries is needed
             self.damaged += bool(rest)
             return self._decoded(data)
         if rest and _begins_with_a_frame(data):
-            rest = b""  # the rest of that frame was lost
+            rest = b""  # the rest of that frame never arrived
             self.damaged += 1
         self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         found = self._parsed(rest + data)
@@ -374,7 +374,7 @@ class ModeFlag(IntFlag):
 
 
 class SystemState(IntEnum):
-    """Those values of a heartbeat's ``system_status`` that are used here."""
+    """The values of a heartbeat's ``system_status`` that are used here."""
 
     STANDBY = 3
     ACTIVE = 4

@@ -1,4 +1,4 @@
-"""An emulated racing drone with Betaflight, flying a simulated vehicle, for any program that uses MSP over TCP.
+"""An emulated Betaflight racing drone that flies a simulated vehicle and is open to any program using MSP over TCP.
 
 To use it in a test::
 
@@ -50,7 +50,7 @@ HOVER_THROTTLE: Final = 0.32  #: hover throttle as a fraction of full throttle; 
 THRUST_POWER: Final = 1.6  #: exponent with which thrust depends on throttle; an estimate
 CELLS: Final = 4
 
-#: A 5-inch quadrotor with a four-cell battery. The values are estimates of typical ones.
+#: A 5-inch quadrotor with a four-cell battery. The values are typical estimates.
 RACER: Final = VehicleParameters(
     mass_kg=0.6,
     radius_m=0.18,
@@ -96,8 +96,8 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
-#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. Not included
-#: are 59, 61, 68 (which restarts it) and 69, which get other replies or none.
+#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. This excludes
+#: 59, 61, 68 (which restarts it) and 69, which get other replies or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
 )
@@ -117,7 +117,7 @@ class BoardSettings:
     rx_msp: bool = True
     gps: bool = True
     barometer: bool = True
-    boot_s: float = 0.5  #: time until it can be armed [s]; 5 s with real ones
+    boot_s: float = 0.5  #: time until it can be armed [s]; 5 s on real ones
     flags: int = 0  #: additional flags that prevent arming, one bit each
 
 
@@ -133,12 +133,12 @@ API: Final = (1, 47)
 VERSION: Final = (4, 6, 0)
 NAME: Final = "EMULATED"
 FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: number of flags, including ARM_SWITCH
-LOSS_NS: Final = nanoseconds(0.15)  #: the receiver counts as lost after this time without sticks
+LOSS_NS: Final = nanoseconds(0.15)  #: time without sticks after which the receiver counts as lost
 HOLD_NS: Final = nanoseconds(0.3)  #: how long the last sticks remain in force
 RECOVERY_NS: Final = nanoseconds(0.5)  #: how long sticks must arrive before the receiver counts as recovered
 IDLE: Final = 0.055  #: fraction of full throttle at which the motors idle while armed
-LEVEL_RAD: Final = math.radians(25.0)  #: greatest tilt at which it can be armed
-GROUND_M: Final = 0.06  #: it counts as on the ground below this height with little thrust
+LEVEL_RAD: Final = math.radians(25.0)  #: maximum tilt at which it can be armed
+GROUND_M: Final = 0.06  #: height below which it counts as on the ground if its thrust is low
 ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: arbitrary position of the world's origin on Earth
 SATELLITES: Final = 14
 _ROLL, _PITCH, _YAW, _THROTTLE = range(4)
@@ -150,7 +150,7 @@ def bit(name: str) -> int:
 
 
 class Board:
-    """One flight controller. Not thread-safe. Used on the loop's thread.
+    """One flight controller. Not thread-safe: use it only on the loop's thread.
 
     ``received`` has the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
     """
@@ -410,7 +410,7 @@ class Board:
 
 
 class RunningFirmware(RunningEmulator):
-    """A flight controller that is switched on. Belongs to the loop's thread."""
+    """A flight controller that is switched on. Use it only on the loop's thread."""
 
     def __init__(
         self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None
@@ -445,7 +445,7 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.board.tick(report, monotonic_ns())
 
-    def _crashed(self, text: str) -> None:  # noqa: ARG002  its reason does not matter
+    def _crashed(self, text: str) -> None:  # noqa: ARG002  the reason does not matter here
         self.board.crashed()
 
 
@@ -490,7 +490,7 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def board(self) -> Board:
-        """The running flight controller, for tests. Belongs to the loop's thread."""
+        """The running flight controller, for tests. Use it only on the loop's thread."""
         return self._started.board
 
     @property

@@ -1,7 +1,7 @@
 """The firmwares' rate curves and their inverses, from rates and angles to sticks. Pure.
 
-Betaflight has five kinds of rates, plotted in its documentation. Since version 4.5, the lean in ANGLE mode follows the
-same curve; before, it was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
+Betaflight has five kinds of rates, plotted in its documentation. Since version 4.5, the tilt in ANGLE mode follows the
+same curve; before that, it was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire.messages import INAV
 
-Curve = Callable[[float], float]  #: increasing function from a stick, 0 to 1, to a rate [degrees/s] or a fraction
+Curve = Callable[[float], float]  #: increasing function from a stick (0 to 1) to a rate [degrees/s] or a fraction
 
 _KINDS: Final = ("betaflight", "raceflight", "kiss", "actual", "quick")
 _STEPS: Final = 24  #: number of steps in the bisection
@@ -115,7 +115,7 @@ def share_of(curve: Curve) -> Curve:
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, for a value; full stick if the value is out of reach."""
+    """Return the stick, -1 to 1, for a value; full stick if the value can't be reached."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:

@@ -1,4 +1,4 @@
-"""MSP frames: version 1, its long form for 255 bytes and more, and version 2. Pure.
+"""MSP frames: version 1, its long form for 255 or more bytes, and version 2. Pure.
 
 A version 1 frame is ``$M``, direction, size, function, payload and xor; a version 2 frame is ``$X``, direction, flags,
 function (16 bits), size (16 bits), payload and CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Final
 
 MOST: Final = 1024  #: longest payload that the parser waits for; the longest in use, mode names, is below 700 bytes
-LONG: Final = 255  #: size in version 1 which means that the actual size is in the next two bytes
+LONG: Final = 255  #: version 1 size meaning that the next two bytes hold the actual size
 LARGEST: Final = 0xFFFF
 
 
@@ -22,7 +22,7 @@ class Direction(Enum):
 
     REQUEST = ord("<")  #: sent to the flight controller
     REPLY = ord(">")
-    ERROR = ord("!")  #: the flight controller does not support the function or refuses it
+    ERROR = ord("!")  #: the flight controller refuses or does not support the function
 
 
 _DIRECTIONS: Final = {each.value: each for each in Direction}
@@ -100,7 +100,7 @@ class Parser:
     """Finds frames in a byte stream that may contain other bytes. Never raises.
 
     After a bad checksum, the search resumes at the byte after the ``$``, so that a frame with missing bytes does not
-    cost the next one. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
+    take the next one with it. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
     """
 
     def __init__(self) -> None:

