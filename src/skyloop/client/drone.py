@@ -782,18 +782,20 @@ class Drone:
             UsageError: If called from an inline callback.
         """
         deadline = time.monotonic() + timeout_s
+        waited_s = 0.0  # in a stepped replay the time waited for passes at once
         while True:
             # Each time, because the proxy may have restarted with another camera.
             channel = self._state.video.channel(camera)
             channel.keep()
             self._connection.check_may_wait()
-            left_s = min(_CAMERA_CHECK_S, deadline - time.monotonic())
+            left_s = min(_CAMERA_CHECK_S, deadline - time.monotonic(), timeout_s - waited_s)
             while channel.notifier.wait_for(lambda: channel.unread or self.closed, left_s):  # noqa: B023
                 self._connection.check_open()
                 frame = channel.read()
                 if frame is not None:
                     return frame
-            if time.monotonic() >= deadline:
+            waited_s += left_s
+            if time.monotonic() >= deadline or waited_s >= timeout_s:
                 raise self._state.no_frame(channel.camera.name, timeout_s)
 
     def frames(
