@@ -143,6 +143,9 @@ def test_frames(proxy: ScriptedProxy) -> None:
             with pytest.raises(NoAnswerError, match="no frame of bottom"):
                 async for _ in drone.frames("bottom", timeout_s=0.02):
                     pass
+            with pytest.raises(TypeError, match="max_age"):
+                async for _ in drone.frames(max_age=0.2):  # type: ignore[call-arg]
+                    pass
 
     run(look())
 

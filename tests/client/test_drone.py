@@ -104,6 +104,20 @@ def test_an_unknown_camera(drone: Drone) -> None:
         drone.on_frame(lambda frame: None, "left")
 
 
+@pytest.mark.parametrize("misspelt", [{"max_age": 0.2}, {"max_fp": 5}, {"scal": 0.5}])
+def test_a_misspelt_option_of_frames_is_an_error(drone: Drone, misspelt: dict[str, Any]) -> None:
+    """A program that believes that it refuses old frames would fly by them."""
+    with pytest.raises(TypeError, match=next(iter(misspelt))):
+        next(drone.frames(**misspelt))
+    with pytest.raises(TypeError, match=next(iter(misspelt))):
+        drone.on_frame(lambda frame: None, **misspelt)
+
+
+def test_no_encoding_is_not_jpeg(drone: Drone) -> None:
+    with pytest.raises(UsageError, match="encoding"):
+        next(drone.frames(encoding=""))  # type: ignore[arg-type]
+
+
 def test_frames_as_an_iterator(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     waiting = threading.Event()

@@ -181,6 +181,8 @@ def test_notes_and_marks_have_limits(folder: Path) -> None:
             recording_files.add_mark(path, at_s, "")
     with pytest.raises(UsageError, match="at most 200 characters"):
         recording_files.add_mark(path, 1.0, "x" * 201)
+    with pytest.raises(UsageError, match="at most 200 characters"):
+        recording_files.remove_mark(path, Mark(1.0, "x" * 201))
     assert not notes_path(path).exists()
     for number in range(200):
         recording_files.add_mark(path, 200.0 - number, f"{number}")

@@ -289,15 +289,26 @@ class VideoChannels:
         self._history = history
         self._making = threading.RLock()  # so that two threads that request the same channel get the same one
 
-    def channel(self, camera: str | None = None, **how: Unpack[VideoOptions]) -> VideoChannel:
+    def channel(  # written out: a misspelt limit on a frame's age must be a TypeError
+        self,
+        camera: str | None = None,
+        *,
+        encoding: VideoEncoding | None = None,
+        quality: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        part: tuple[int, int] | None = None,
+        kbit_s: int | None = None,
+        max_age_s: float | None = None,
+    ) -> VideoChannel:
         """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
         ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`. Raises also
         :class:`MissingExtraError` if H.264 is requested and PyAV is not installed.
         """
         self._connection.check_open()
-        checked_age(how.get("max_age_s"))
-        channels, encoding, quality = self.channels, how.get("encoding") or "jpeg", how.get("quality")
+        checked_age(max_age_s)
+        channels = self.channels
         if not channels:
             raise UnsupportedError("this vehicle has no camera")
         channel = next(iter(channels.values())) if camera is None else channels.get(camera)
@@ -309,13 +320,13 @@ class VideoChannels:
             require_pyav(_PURPOSE)
         request = VideoRequest(
             channel.camera.name,
-            encoding=encoding,
+            encoding="jpeg" if encoding is None else encoding,
             quality=DEFAULT_QUALITY if quality is None else quality,
-            max_fps=how.get("max_fps"),
-            scale=how.get("scale", 1.0),
-            part=how.get("part"),
-            kbit_s=how.get("kbit_s"),
-            subscriber=self.subscriber if encoding == "h264" and how.get("kbit_s") is None else "",
+            max_fps=max_fps,
+            scale=scale,
+            part=part,
+            kbit_s=kbit_s,
+            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
         )
         return channel if request == channel.request else self.made(channel.camera, request)
 

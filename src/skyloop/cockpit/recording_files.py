@@ -108,6 +108,7 @@ def add_mark(path: Path, at_s: float, text: str) -> Notes:
 
 def remove_mark(path: Path, mark: Mark) -> Notes:
     """Remove a mark from a recording. Raise ``UnknownNameError`` if the recording has no such mark."""
+    check_mark(mark.text)
     notes = read_notes(path)
     if mark not in notes.marks:
         raise UnknownNameError("mark", f"{mark.at_s:g} s {mark.text}", [f"{m.at_s:g} s {m.text}" for m in notes.marks])

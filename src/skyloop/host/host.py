@@ -73,7 +73,7 @@ class Host:
 
     def proxies(self) -> list[Proxy]:
         """Return the proxies currently serving in this process. Any thread."""
-        return [vehicle.proxy for vehicle in list(self.vehicles.values()) if vehicle.proxy is not None]
+        return [proxy for vehicle in list(self.vehicles.values()) if (proxy := vehicle.proxy) is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
 
@@ -103,8 +103,8 @@ class Host:
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
             # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
-            if vehicle.proxy is not None and vehicle.runs:
-                self._ticker.add(vehicle.proxy)
+            if (proxy := vehicle.proxy) is not None and vehicle.runs:
+                self._ticker.add(proxy)
         return vehicle
 
     def _make(self, settings: VehicleSettings, network: FabricSettings | None) -> HostedVehicle:
