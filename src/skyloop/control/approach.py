@@ -135,7 +135,7 @@ class OrbitMarker(FollowMarker):
             settings: Settings for the control law; None for the defaults with ``aside_rad`` 0.05.
 
         Raises:
-            UsageError: A number is out of its range.
+            UsageError: A number is out of range.
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
@@ -195,7 +195,7 @@ class OrbitPlace(FollowPath):
             source: Position source; None for the vehicle's own feedback.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         if look not in ("in", "out"):
             raise UsageError(f"look is {look!r} and must be 'in' or 'out'")
@@ -265,7 +265,7 @@ class LandOnMarker(Behaviour):
         return self.done and self.phase is LandingPhase.DOWN
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the control law and send its set-point; after touch-down, wait until the vehicle reports landed."""
+        """Update the control law and send its set-point; after touch-down, wait for the vehicle to report a landing."""
         self._flew = self._flew or feedback.state.airborne
         down = self.phase is LandingPhase.DOWN
         if self._flew and feedback.state is FlightState.LANDED and not self.done:

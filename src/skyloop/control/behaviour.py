@@ -42,7 +42,7 @@ class Behaviour(Controller):
     """
 
     name = "behaviour"  #: source of the annotations and prefix of event texts
-    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target; a warning reports their start
+    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target, whose start is a warning
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.
@@ -59,7 +59,7 @@ class Behaviour(Controller):
         self.camera = camera
         self.done = False  #: whether the behaviour has ended
         self.blind = False  #: whether the vehicle is hovering because no frames arrive
-        self.problem = ""  #: missing part of the vehicle's state, which causes hovering
+        self.problem = ""  #: missing part of the vehicle's state that causes the hovering
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture time of the newest frame

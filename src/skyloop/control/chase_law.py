@@ -3,7 +3,7 @@
 Yaw keeps the target in the centre of the image, the distance is controlled along the line of sight, and height and
 sideways motion are controlled separately. This is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli
 ("Vision based GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013). Here it is applied to
-estimated metres, so that the gains depend on neither lens nor target size, and the target's velocity is fed forward.
+distances in metres, so that the gains depend on neither lens nor target size, and the target's velocity is fed forward.
 Vehicles that report no velocity are flown by attitude with dead reckoning (:class:`.airframe.TiltVelocity`).
 """
 
@@ -77,8 +77,8 @@ class ChaseSettings:
     #: target, π behind it and π/2 on its left. With None, the vehicle stays on the side that it is on.
     bearing_rad: float | None = None
     orbit_m_s: float = 0.8  #: speed around the target; positive is counter-clockwise as seen from above
-    #: Maximum horizontal distance from the start, where the vehicle only turns, even if a target approaches; None means
-    #: no leash. It is measured by the vehicle's position or, if unknown, its integrated velocity, which drifts.
+    #: Maximum horizontal distance from the start, not exceeded even to evade a target; None means no leash. It is
+    #: computed from the vehicle's position or, if unknown, from its integrated velocity, which drifts.
     leash_m: float | None = None
     height_m: float | None = None  #: height above the ground; None for the height at the start
     lowest_m: float = 0.8  #: minimum height above the ground
@@ -88,7 +88,7 @@ class ChaseSettings:
     parallax_m: float | None = 0.4
     #: maximum elevation of the target's centre, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
-    lead_s: float = 0.12  #: total delay of feedback and commands until a command takes effect
+    lead_s: float = 0.12  #: total delay of feedback and commands
     response_s: float = 0.4  #: time to reach a commanded velocity; the target's velocity is predicted this far ahead
     range_gain: float = 1.0  #: [1/s]
     velocity_gain: float = 3.0  #: acceleration per unit of velocity error [1/s]
@@ -157,7 +157,7 @@ _SETPOINT_AHEAD = 4.0  # limit on the set-point's change as a multiple of the ve
 _APPROACH_HORIZON_S = 3.0  # time within which the vehicle gives way to an approaching target
 _CONFIDENT_SIGMA_M = 0.35  # maximum standard deviation for a position to count as certain
 _UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
-_KEEP_SIDE_S = 1.0  # time to keep evading to the same side
+_KEEP_SIDE_S = 1.0  # time for which evasion stays on the same side
 _HEAD_ON_SHARE = 0.2  # fraction of the clearance below which a pass is head-on, so that both sides are equally good
 _SWEEP_BACK_SHARE = 0.4  # fraction of the sweep to the side opposite to the target's motion
 _HEIGHT_REACHED_M = 0.1  # distance from a parallax height at which the vehicle heads for the other one
@@ -179,7 +179,7 @@ class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state."""
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         self.settings = settings or ChaseSettings()  #: settings, which can be replaced in flight
         self.mode = mode  #: pursuit mode, which can be changed in flight
         self.phase = TargetPhase.LOOKING  #: phase at the last step
@@ -216,7 +216,7 @@ class ChaseLaw:
         candidate: TargetState | None = None,  # a possible match for the lost target; the vehicle turns towards it
         # whether the vehicle reports no velocity (see :class:`.airframe.TiltVelocity`) and is flown by attitude
         relative: bool = False,
-        # the vehicle's position in world axes [m]; if None, the leash integrates the velocity
+        # the vehicle's position in world axes [m]; without it, the leash relies on integrated velocity
         position: Vector | None = None,
     ) -> Velocity | Attitude:
         """Compute the current set-point."""
@@ -326,7 +326,7 @@ class ChaseLaw:
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
         """Return the angle [rad] by which to look to the left of the target's expected position, and its rate.
 
-        The view sweeps to both sides while hovering, first and furthest in the direction of the target's last motion.
+        While hovering, the vehicle looks to both sides, first and furthest in the target's last direction of motion.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -418,7 +418,7 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
         The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
-        position is uncertain, for example out of view, the vehicle stays further away and allows for a stop.
+        position is uncertain, for example out of view, the vehicle stays further away and is prepared for it to stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
@@ -540,6 +540,6 @@ def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
 
 
 def _not_towards(velocity: Array, sight: Array) -> Array:
-    """Remove the velocity component towards a hidden target, because whatever hides it may be in the way."""
+    """Remove the velocity component towards a hidden target, because the obstacle that hides it may be in the way."""
     direction = sight / max(1e-6, float(np.hypot(*sight)))
     return velocity - direction * max(0.0, float(velocity @ direction))

@@ -142,9 +142,9 @@ class Controller:
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
         """Call the callbacks until time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
-        An exception in a callback, Ctrl-C or ``sys.exit()`` makes an airborne vehicle hover, if this client flies it,
-        and propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the run:
-        instead, :meth:`on_authority` is called. Once a ready-made controller has finished, it does not fly again:
+        After an exception in a callback, Ctrl-C or ``sys.exit()``, an airborne vehicle flown by this client hovers, and
+        the exception propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the
+        run: instead, :meth:`on_authority` is called. Once a ready-made controller has finished, it does not fly again:
         further runs end at once.
 
         Args:

@@ -24,9 +24,9 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
 _SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
-_TILT_RAD = 0.012  # standard deviation of elevations, due to errors in attitude and in pole tops in the image
-_REPEATED = 3.0  # noise factor, because errors repeat from one sighting to the next
-_SIDES = 3  # number of viewing directions: along a gate's axis and from both sides
+_TILT_RAD = 0.012  # standard deviation of elevations, due to errors of the attitude and of pole tops in the image
+_REPEATED = 3.0  # factor for the noise, because errors repeat from one sighting to the next
+_SIDES = 3  # number of viewing directions: along a gate's axis and from either side
 
 
 class GatePlace(NamedTuple):
@@ -99,7 +99,7 @@ class CourseLaw(VelocityLaw):
         #: Phase and position of the vehicle in the gate's axes at the last step.
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
         self.way: list[Point] = []  #: the points of the route, in odometry axes
-        self.stuck: str | None = None  #: why the vehicle can't continue; None while it can
+        self.stuck: str | None = None  #: reason why the vehicle can't continue; None if it can
         self._gates, self._widths = tuple(gates), tuple(widths_m)
         self._shift = np.array([-start[0], -start[1], 0.0])  # offset from map axes to odometry axes
         self._shift_m = s.start_m
@@ -132,7 +132,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Trust the map no more than at the start, and look at the gate again."""
+        """Reduce the trust in the map to that at the start, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self.number)

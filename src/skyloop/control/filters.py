@@ -1,4 +1,4 @@
-"""Low-pass, complementary and median filters for irregularly sampled signals, pure: the time step is an argument."""
+"""Low-pass, complementary and median filters for irregularly sampled signals. Pure; the time step is an argument."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Complementary:
 
         Args:
             rate: Rate over the last ``dt_s`` [rad/s].
-            measured: The angle at the end of ``dt_s`` [rad]; None if not measured.
+            measured: The measured angle at the end of ``dt_s`` [rad]; None if there is none.
             dt_s: Time since the last sample.
 
         Returns:
@@ -116,7 +116,7 @@ class Complementary:
 class Median:
     """The median of the last samples of a number, which removes single outliers and keeps edges sharp.
 
-    The result is always one of the samples: if their number is even, the lower of the two in the middle.
+    The result is always one of the samples; for an even number, it is the lower of the middle two.
     """
 
     def __init__(self, length: int = 5) -> None:

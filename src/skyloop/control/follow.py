@@ -50,7 +50,7 @@ class FollowSettings:
     #: Fraction of the velocity error added to the set-point, to stiffen a soft velocity loop against gusts.
     velocity_gain: float = 0.7
     aside_gain: float = 1.2  #: gain for moving around to the front of the marker [1/s]
-    aside_rad: float = 0.3  #: deviation from the station's angle up to which the vehicle stays in place
+    aside_rad: float = 0.3  #: maximum angle from the station at which the vehicle stays in place
     speed_m_s: float = 1.2  #: maximum horizontal speed
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
@@ -67,7 +67,7 @@ class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)

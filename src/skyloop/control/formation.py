@@ -198,16 +198,16 @@ def kept_apart(
 ) -> Places:
     """Change velocities so that drones closer together than ``apart_m`` separate.
 
-    Their distance is made to grow at ``gain`` times the missing distance, with each drone contributing half. If one of
-    them doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the distance
-    beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
+    Their distance grows at a rate of ``gain`` times the missing distance, and each drone contributes half of that. If
+    one of them doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the
+    distance beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
 
     Args:
         velocities: Velocities in world axes, (n, 3) [m/s].
         positions: Positions in world axes, (n, 3) [m].
         apart_m: The minimum allowed distance.
         gain: Rate of separation per metre of missing distance [1/s].
-        fixed: Number of drones at the end of the list that don't yield because they are not steered here.
+        fixed: Number of drones at the end of the list that don't yield because something else steers them.
 
     Returns:
         The changed velocities, (n, 3) [m/s].

@@ -96,7 +96,7 @@ class Formation:
             slots: Positions in world axes, (n, 3) [m]; at least one for each drone.
             speed_m_s: Maximum speed of the drone that has the longest path.
             yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Time after which drones not at their slots have failed; None adds ten seconds to the plan.
+            timeout_s: Time until drones not at their slots have failed; None allows ten seconds more than planned.
 
         Returns:
             A report with the drones' final positions and how close they came to each other.
@@ -196,7 +196,7 @@ class Formation:
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
         """Return the newest states of the drones steered here and the last known states of all other airborne drones.
 
-        If a drone steered here no longer knows its position, it has failed and counts among the others.
+        A drone steered here fails if its position is no longer known, and then counts as one of the others.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -281,7 +281,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """Larger acceptance radii for drones hovering just after arrival."""
+        """The settings with larger acceptance radii, for drones that hover just after arrival."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:

@@ -54,7 +54,7 @@ class GateSettings:
     The defaults suit a small indoor vehicle and openings about a metre wide.
     """
 
-    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
+    lead_s: float = 0.12  #: delay between computing a command and its effect
     #: Fraction of the velocity error added to the set-point, to stiffen a soft velocity loop against gusts.
     velocity_gain: float = 1.0
     speed_m_s: float = 1.1  #: maximum horizontal speed
@@ -66,10 +66,10 @@ class GateSettings:
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
     stand_m: float = 1.7  #: distance in front of the gate at which the vehicle must be aligned
-    aligned_m: float = 0.15  #: maximum offset from the axis, sideways and in height
+    aligned_m: float = 0.15  #: maximum lateral and vertical offset from the axis
     aligned_rad: float = 0.25  #: maximum heading error
     cone: float = 0.3  #: additional offset allowed per metre of distance beyond `stand_m`
-    beyond_m: float = 0.7  #: distance behind the gate at which it counts as passed
+    beyond_m: float = 0.7  #: distance behind the gate at which the gate counts as passed
     fresh_s: float = 0.4  #: time to continue without a sighting
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
@@ -90,7 +90,7 @@ class GateLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: GateSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = GatePhase.SEARCHING  #: phase at the last step
@@ -206,7 +206,7 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, without the start but with the goal; None if there is no way.
+    """Return the points of the shortest way, including the goal but not the start; None if there is no way.
 
     Start and goal may be too close to a wall, but the way comes no closer to it. Points are east, north [m]. Pass at
     most a few dozen walls, because the effort grows with the cube of their number.

@@ -33,7 +33,7 @@ class GateKind:
     turning: float = 1.0  #: direction to turn first if the gate is out of view: positive for left, negative for right
 
 
-#: The course of the world ``gates``.
+#: The gates in the simulated world ``gates``.
 FIVE_GATES = (
     GateKind("gate 1", (235, 110, 20)),
     GateKind("gate 2", (31, 143, 224)),
@@ -60,7 +60,7 @@ class Course:
             raise UsageError(f"each gate needs one place: got {len(self.gates)} gates and {len(self.places)} places")
 
 
-#: The gates of the worlds ``race0`` to ``race3``.
+#: The gates in the simulated worlds ``race0`` to ``race3``.
 RACE_GATES = (
     GateKind("gate 1", (31, 143, 224)),
     GateKind("gate 2", (224, 194, 31)),
@@ -68,7 +68,7 @@ RACE_GATES = (
     GateKind("gate 4", (194, 63, 180)),
 )
 RACE_POLES = (208, 31, 31)  #: colour of the poles in these worlds
-#: The track of the worlds ``race0`` and ``race1``. In ``race2`` everything is displaced by up to 0.45 m.
+#: The track in the worlds ``race0`` and ``race1``; in ``race2``, everything is displaced by up to 0.45 m.
 RACE_TRACK = Course(
     RACE_GATES,
     (
@@ -116,7 +116,7 @@ class FlyThroughGates(Behaviour):
     hovers and the behaviour ends with a warning.
 
     Gates are detected by colour. After losing sight of a gate, the vehicle holds its position, turns to where it
-    expects the gate, then searches for it. The vehicle must be airborne when :meth:`run` is called.
+    expects the gate, and then searches for it. The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         passed: Number of gates flown through.

@@ -136,7 +136,7 @@ class ImageServoLaw(VelocityLaw):
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
     ) -> None:
-        """Initialise the control law with the points wanted in a level camera, (n, 2) at z = 1, and their depth [m]."""
+        """Initialise the law with the points that a level camera should see, (n, 2) at z = 1, and their depth [m]."""
         mounting_rotation(camera)  # raises any error here rather than in flight
         s = self.settings = settings or ServoSettings()
         limits = SetpointLimits(
@@ -314,7 +314,7 @@ class FlowLaw(AirframeLaw):
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING  #: phase at the last step

@@ -34,7 +34,7 @@ _CLIMB_M_S = 0.3  # initial standard deviation of the vertical velocity
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """A point's position and velocity at a point in time, with their covariance."""
+    """The position and velocity of a target at a point in time, with their covariance."""
 
     at_ns: int
     position: Array  #: position, (n,) [m]
@@ -50,7 +50,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnEstimate:
-    """A point's motion at a point in time."""
+    """The motion of a turning target at a point in time."""
 
     at_ns: int
     position: Array  #: position, (3,) [m]
@@ -204,7 +204,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
                 accepts all.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         if isinstance(dimensions, bool) or not isinstance(dimensions, int) or dimensions < 1:
             raise UsageError(f"dimensions is {dimensions!r} and must be a whole number of at least 1")
@@ -264,7 +264,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
             gate: Mahalanobis distance, in standard deviations, above which positions are refused.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         super().__init__(
             3,

@@ -39,7 +39,7 @@ from skyloop.messages.geometry import rotation_from_euler
 
 _MAY_BE_0 = frozenset({"wait_s", "climb_gain", "sight_s"})
 _MAY_BE_INFINITE = frozenset({"give_up_s", "ceiling_m"})
-_BELOW_CEILING_M = 0.2  # distance of the search height from the maximum altitude, near which the proxy slows climbs
+_BELOW_CEILING_M = 0.2  # margin of the search height to the maximum altitude, because the proxy slows climbs near it
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +55,18 @@ class LandingSettings:
     climb_gain: float = 1.0  #: fraction of the climb rate error added to the set-point
     speed_m_s: float = 8.0  #: maximum horizontal speed
     climb_m_s: float = 0.7  #: maximum vertical speed
-    acceleration_m_s2: float = 15.0  #: limit on changes of the horizontal set-point, for fast-responding vehicles
-    climb_acceleration_m_s2: float = 2.0  #: limit on changes of the vertical set-point
+    acceleration_m_s2: float = 15.0  #: maximum rate of change of the horizontal set-point, for fast-responding vehicles
+    climb_acceleration_m_s2: float = 2.0  #: maximum rate of change of the vertical set-point
     closing_m_s: float = 1.5  #: maximum speed relative to the marker while approaching it
     braking_m_s2: float = 1.0  #: deceleration to the marker's velocity on arrival
     known_m_s: float = 0.5  #: standard deviation of the marker's velocity below which the vehicle follows it
     sight_m: float = 0.004  #: standard deviation of marker positions close to the camera
-    sight_share: float = 0.004  #: growth of that deviation per metre of distance
+    sight_share: float = 0.004  #: increase of this deviation per metre of distance
     sight_s: float = 0.01  #: possible delay between attitude and frame; its effect grows with the turn rate
 
     descent_m_s: float = 0.45
     cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
-    cone: float = 0.2  #: growth of the cone's radius per metre of height
+    cone: float = 0.2  #: increase of the cone's radius per metre of height
     view: float = 0.3  #: ratio of offset to height above which the vehicle climbs to see the marker
     #: Height below which the vehicle relies on the filter and descends even without sight of the marker, provided that
     #: it is over the marker's centre, matches its speed, and the marker has moved as predicted ``foresight_s`` earlier.
@@ -91,7 +91,7 @@ class LandingSettings:
     turn_rad_s: float = 0.8
     long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
 
-    fresh_s: float = 0.35  #: time to continue without a sighting
+    fresh_s: float = 0.35  #: time to carry on without a sighting
     recovering_s: float = 4.0  #: time to follow the predicted position of an unseen marker before searching
     search_height_m: float = 2.6  #: height above the ground for searching and for hovering safely
     search_speed_m_s: float = 1.0
@@ -171,7 +171,7 @@ class LandingLaw(AirframeLaw):
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING  #: phase at the last step

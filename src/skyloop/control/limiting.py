@@ -24,7 +24,7 @@ _LONGEST_STEP_S = 0.2  # maximum time step, so that a longer pause does not allo
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """Return a vector (n,) shortened to the length ``longest`` if it is longer; zero if a component is not finite."""
+    """Return a vector (n,), shortened if it is longer than ``longest``; zero if a component is not finite."""
     length = math.sqrt(float(vector @ vector))
     if length <= longest and length < math.inf:
         return vector

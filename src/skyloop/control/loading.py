@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache takes a file with the same size and second as unchanged."""
+    """Always compiles the source, because Python's cache treats files with the same size and second as unchanged."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -153,7 +153,7 @@ class Reloader:
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
-        """Return the new class or the error that prevented loading it; None if there have been no new saves."""
+        """Return the new class or the error that prevented loading it; None if there is nothing new."""
         return self._loaded.popleft() if self._loaded else None
 
     def look(self) -> None:

@@ -31,7 +31,7 @@ class MotionProfile:
     def __init__(self, stretches: Sequence[tuple[float, float]], acceleration_m_s2: float) -> None:
         """Compute the profile from the length [m] and maximum speed [m/s] of each stretch.
 
-        A stretch of length 0 and speed 0 is a stop. Stretches no longer than :data:`SHORTEST_M` take no time.
+        A stop is a stretch with length 0 and speed 0. Stretches no longer than :data:`SHORTEST_M` take no time.
         """
         #: Start time [s], start distance [m], speed and acceleration of each piece.
         self._pieces: list[tuple[float, float, float, float]] = []
@@ -91,7 +91,7 @@ _MOST: Final = 1e6
 
 
 class Path(Protocol):
-    """Position and velocity over time, from 0 to ``duration_s``; before and after, the path stays at its ends."""
+    """Position and velocity over time, from 0 to ``duration_s``; outside this interval, the path stays at its ends."""
 
     @property
     def duration_s(self) -> float: ...
@@ -338,7 +338,7 @@ class Spline:
             times_s: Time at each point, starting at 0 and increasing.
 
         Raises:
-            UsageError: There isn't one time for each point, or the times don't start at 0 or don't increase.
+            UsageError: There are more or fewer times than points, or the times don't start at 0 or don't increase.
             MissingExtraError: SciPy is not installed.
         """
         places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)

@@ -1,9 +1,9 @@
 """A control law that keeps a vehicle on a path, computing velocities from positions, and controllers that use it.
 
-The path's velocity is fed forward, ahead by the vehicle's response time, and a PI controller for the position removes
-the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund, "Advanced
-PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so delays
-cause no error.
+The path's velocity is fed forward with the vehicle's response time as lead, and a PI controller for the position
+removes the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund,
+"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so
+delays cause no error.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class PathLaw:
     """Computes velocities from position fixes; the path's time starts with the first fix."""
 
     def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
-        """Initialise the law.
+        """Initialise the control law.
 
         Args:
             path: The path, in world axes.
@@ -186,7 +186,7 @@ class PathLaw:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Pause the path while the vehicle hovers or another client flies; restart from rest with a zero integral."""
+        """Pause the path because the vehicle hovers or another client flies it; restart from rest without integral."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None
@@ -347,7 +347,7 @@ class FollowPath(_PathFlyer):
     Attributes:
         path: The path.
         on_path: Whether the vehicle has reached the start of the path.
-        error: Tracking error between start and end of the path.
+        error: Tracking error from the start of the path to its end.
         done: Whether the whole path has been flown.
         lost: Whether the vehicle hovers because its position is unknown.
     """

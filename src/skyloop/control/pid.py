@@ -1,4 +1,4 @@
-"""A PID controller for scalars and a PI controller for vectors, both pure: the time step is an argument.
+"""A PID controller for scalars and a PI controller for vectors. Pure; the time step is an argument.
 
 Both follow Åström and Hägglund, "Advanced PID Control", ISA 2006. The derivative acts on the measurement and is
 filtered (section 3.3). The part of the output cut off by limits is fed back into the integral (back-calculation,
@@ -153,7 +153,7 @@ class Pid:
         self._output = output
 
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
-        """Restart with an integral term such that the next output is ``output`` and the handover causes no jump.
+        """Restart with an integral term that makes the next output equal to ``output``, to avoid a jump on takeover.
 
         Without an integral gain, the next output depends only on the error and the derivative.
 
@@ -172,7 +172,7 @@ class Pid:
 
 
 class VectorPi:
-    """A PI controller for vectors, whose integral grows neither along axes with limited output nor during pauses.
+    """A PI controller for vectors. Its integral doesn't grow along axes with limited output or during pauses.
 
     Attributes:
         integral: The integral term, (n,), in units of the output.
@@ -200,7 +200,7 @@ class VectorPi:
         """Undo the integral's growth along axes in which the output was limited.
 
         Args:
-            asked: The complete set-point that includes the last output, (n,).
+            asked: The complete set-point, which includes the last output, (n,).
             applied: The same set-point after limiting, (n,).
         """
         wound_up = (applied - asked) * (self.integral - self._before) < 0.0

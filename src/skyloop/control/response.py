@@ -28,7 +28,7 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
 
 _STEP_S = 0.01  # time step of the prediction
-_LONGEST_GAP_S = 0.25  # maximum gap in the feedback over which the motion is still modelled
+_LONGEST_GAP_S = 0.25  # maximum gap in the feedback across which the model continues
 _LONGEST_PREDICTION_S = 0.5  # maximum time to predict beyond the last feedback
 _KEPT_SETPOINTS = 64  # number of recent set-points to keep
 
@@ -41,7 +41,7 @@ class ResponseSettings:
     lag_s: float = 0.1  #: time constant of the lean; Engel, Sturm and Cremers, IROS 2012, give a rate of 10 1/s
     delay_s: float = 0.05  #: time from sending a set-point until it takes effect in the loop
     tilt_rad: float = 0.5  #: maximum lean demanded by the loop; see also ``LandingSettings.within``
-    push_m_s3: float = 1.5  #: typical change of the push from the air in one second [m/s² per √s]
+    push_m_s3: float = 1.5  #: typical change of the push of the air in one second [m/s² per √s]
     velocity_noise_m_s: float = 0.05  #: noise of the velocity reported in feedback
     trim_s: float = 0.3  #: time constant for learning the trim
 
@@ -79,12 +79,12 @@ class VelocityResponse:
         self._push = np.zeros(2)
         self._trim = np.zeros(2)
         self._lean = np.zeros(2)  # acceleration caused by the lean
-        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push, per axis
+        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # for velocity and push, per axis
 
     def add(self, feedback: Feedback) -> None:
         """Update with the next sample; ignore it if it lacks velocity or attitude or is not newer than the last one.
 
-        If it is over half a second older than the last one, that one was stamped ahead, and the model restarts.
+        If it is over half a second older than the last one, that one's time was wrong, and the model restarts.
         """
         if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return

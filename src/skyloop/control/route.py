@@ -175,7 +175,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route once all its numbers are known to be in range, including those of routes built by a program."""
+    """Return the route after checking that all numbers are in range, also in routes built by a program."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -203,7 +203,7 @@ class Conditions:
 class Finding(msgspec.Struct, frozen=True):
     """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: number from 1 (for a leg, that of its end), or None for the whole route
+    waypoint: int | None  #: number, from 1; for a leg, that of its end; None for the whole route
     severity: Literal["error", "warning"]
     reason: str
 
@@ -260,7 +260,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
     """Check a route against a drone's newest feedback and parameters; waits for the proxy's answer.
 
-    An observer's connection is enough. If no position is known, such as after connecting, this waits up to ``wait_s``.
+    An observer's connection is enough. It waits up to ``wait_s`` for the first position.
     """
     feedback = None
     with suppress(LinkError):  # missing feedback becomes a finding

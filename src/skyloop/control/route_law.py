@@ -351,7 +351,7 @@ class FlyRoute(Controller):
                 self._leg = None
                 if isinstance(effect.action, Position):
                     self._leg = ask(self.drone, effect.action)
-                else:  # the route makes the vehicle hover or land, not a person
+                else:  # the route, not a person, requested the hover or landing
                     let_go(self.drone, f"the route is {self.law.state.value}", land=isinstance(effect.action, Land))
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
@@ -377,7 +377,7 @@ class FlyRoute(Controller):
             self._on_progress(step)
 
     def _why_ended(self) -> str:
-        """Return why the current leg ended early, but only once; empty while it is being flown."""
+        """Return why the current leg ended early, reporting it only once; empty while the leg is being flown."""
         flown = commands(self.drone)
         outcome = None if self._leg is None else flown.outcome(self._leg)
         if outcome is None or not outcome.failed or not flown.may_ask:

@@ -38,7 +38,7 @@ _BESIDE: Final = 0.75  # maximum distance from the optical axis as a fraction of
 _STEEPEST: Final = 0.15  # minimum cosine of the elevation: objects almost straight above or below have no azimuth
 _TILT_RAD: Final = 0.008  # error of roll and pitch at the time of capture, which shifts both edges equally
 _YAW_RAD: Final = 0.006  # error of the yaw at the time of capture
-_UNTIMELY_S: Final = 0.06  # delay by encoding, network and decoding for images stamped on arrival
+_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, due to encoding, network and decoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +151,7 @@ class BoxView:
 
 
 def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
-    """Return the approximate box [px] of an upright object with a width-to-height ratio; None if not fully in view."""
+    """Return an upright object's approximate box [px], given its aspect ratio; None if it is not fully in view."""
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:
         return None
@@ -169,10 +169,10 @@ _MOST_SURPRISE: Final = 4.0  # maximum contribution of a single box to the avera
 _STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move straight on
 _GONE_S: Final = 0.2  # minimum time out of view before a target counts as hidden ...
 _GONE_INTERVALS: Final = 2.5  # ... and the minimum time in intervals between boxes
-_BEFORE_S: Final = 0.2  # age at the last sighting of boxes assumed free from occlusion
+_BEFORE_S: Final = 0.2  # age, at the last sighting, of boxes that are assumed to be free from occlusion
 _GATE: Final = 4.0  # maximum azimuth error in standard deviations
 _EDGE_GATE: Final = 3.0  # maximum edge error in standard deviations; beyond it, the edge is hidden or not the target's
-_OUTGROWN: Final = 3.0  # error of both outer edges in standard deviations above which a box is too large
+_OUTGROWN: Final = 3.0  # error of both edges, in standard deviations, above which a box is too large
 _PACE_PER_S: Final = 0.2  # standard deviation of the velocity per metre of the guessed range
 LEAST_SLOPE: Final = 0.04  # minimum slope at which an edge's height reveals the range
 SURE_OF_SIZE: Final = 0.4  # standard deviation of the log height at which the size counts as unknown
@@ -390,7 +390,7 @@ class TargetEstimator:
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state; it moves on for at most four seconds, while its uncertainty keeps growing.
+        """Predict the target's state; motion continues for at most four seconds, but the uncertainty keeps growing.
 
         For a hidden target, the motion shortly before the loss is used, because the occluder cut off its last boxes.
         """

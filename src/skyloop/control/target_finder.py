@@ -3,8 +3,8 @@
 The finder uses no drone, thread or clock; call it from one thread only. The tracker
 (:class:`skyloop.vision.LongTermTracker`) knows the target's appearance, and the scene (:mod:`.target_scene`) knows
 where all objects are and how they move. Each can find the target when the other fails. To avoid confusion, the
-tracker's box must be where the target can be. After a loss, an object must be there too, and be the only one that looks
-like the target.
+tracker's box must be where the target can be. After a loss, a new object must also be there and be the only one that
+looks like the target.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, 
 
 _SAME: Final = 0.4  # minimum overlap of two boxes that show the same object
 _POINTED_AT: Final = 0.3  # minimum overlap between the user's box and the detection that it selects
-_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are better
-_BESIDE_LATE: Final = 0.25  # the same while late detections provide the size, because the tracker's size drifts
-_TAKEN: Final = 0.5  # minimum fraction of the tracker's box inside another object's for it to show that object
+_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are sharper
+_BESIDE_LATE: Final = 0.25  # the same when late detections provide the size, because the tracker's size drifts
+_TAKEN: Final = 0.5  # fraction of the tracker's box inside another object's box at which it shows that object
 _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
 _DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
 _LATELY_S: Final = 1.0  # time to keep clear of other objects after they were last seen
 _DORMANT_S: Final = 1.0  # time out of view after which the target must be recognised again
 _SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be it
 _LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
-_LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed if in doubt, in order to know the newcomer's motion
+_LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to determine the newcomer's motion
 _LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
 _OF_LATE: Final = 8  # number of images over which the mean difference is averaged
 _TWIN: Final = 0.6  # colour difference below which only position and motion distinguish an object from the target
-_TWIN_S: Final = 60.0  # time after the last sighting of a look-alike for which a newcomer may be that look-alike
+_TWIN_S: Final = 60.0  # time after the last sighting of a look-alike during which a newcomer may be that look-alike
 _TWIN_OFF_M: Final = 1.0  # maximum distance of a newcomer from the target's expected position during this time ...
 _TWIN_OFF_M_S: Final = 0.5  # ... plus this for each second unseen [m/s]
 _OTHER_WAY_M_S: Final = 2.2  # maximum difference between a newcomer's velocity and the target's before it was hidden
@@ -184,7 +184,7 @@ class TargetFinder:
         ]
 
     def _shift(self, camera: Camera, captured_ns: int) -> None:
-        """Shift the tracker's search by the motion of the target in the image that flight and target motion explain."""
+        """Shift the tracker by the image motion to expect from rotation, flight and the target's own motion."""
         if self.estimator is None or self._middle is None:
             return
         middle = camera.pixel(self.estimator.at(captured_ns).middle)
@@ -335,7 +335,7 @@ class TargetFinder:
             self._adopt(scene, best, frame)
 
     def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
-        """Accept a newcomer as the target if it may be there, looks like the target and is the only such object."""
+        """Accept a newcomer as the target if its position is plausible and it is the only object that looks like it."""
         assert target.estimator.seen_ns is not None
         likely: list[tuple[float, SceneObject]] = []
         for each in scene.objects.values():

@@ -1,4 +1,4 @@
-"""Follow any target: the content of a box in the image, or any object of a class.
+"""Follow any target, given by a box in the image or by a class of objects.
 
 :class:`TargetFollower` finds the target in frames and computes set-points; it uses no thread or clock.
 :class:`FollowTarget`, or a page, passes frames and feedback to it and sends the set-points.
@@ -257,7 +257,7 @@ class TargetFollower(AirframeLaw):
         assert view is not None
         box = self.sighting.box
         colour = _SEEN if box is not None else _LOST
-        # Detections from a processor are not drawn here, because it annotates its frames itself.
+        # Detections from a processor are not drawn here, because the processor annotates its frames itself.
         found = () if self._detector is None else self.finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
@@ -288,7 +288,7 @@ class TargetFollower(AirframeLaw):
 class FollowTarget(Behaviour):
     """Keeps a target in view at a distance, circles it or only turns towards it. The vehicle must be airborne.
 
-    The target is whatever is in a box in the first frame, or the largest object of a class. It is tracked by appearance
+    The target is the object in a box in the first frame, or the largest object of a class. It is tracked by appearance
     and, if there is a detector, by detections, and is distinguished from look-alikes. While the target is hidden, the
     vehicle first follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour ends
     in a hover. Neither a position nor a map is needed. Vehicles that report no velocity are flown by attitude.
@@ -323,7 +323,7 @@ class FollowTarget(Behaviour):
             class_name: Class whose largest object to follow if there is no box; requires a detector.
             distance_m: Horizontal distance to keep; None for the distance in the settings.
             bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
-                ahead of it, π behind it. None for the side in the settings or, by default, any side.
+                ahead of it, π behind it. If None, the settings decide, which by default allow any side.
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Detector that searches every frame, or the name of a processor whose results are detections, such
                 as that of ``skyloop detect``. If None, the target is tracked by appearance only.

@@ -65,10 +65,10 @@ class RangeEstimator(TargetEstimator):
         self._weights = np.ones(0)
         self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground; None once dropped
         self._sight = self._about = np.zeros(3)  # initial line of sight, and recent mean position of the vehicle
-        self._stirred_m = 0.0  # maximum distance from that position across that line so far
+        self._stirred_m = 0.0  # maximum distance from that position so far, across that line of sight
         self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
         self._jumped_ns: int | None = None  # time of the last jump of the height
-        self._base_m = 0.0  # slowly averaged difference between altimeter and climb [m]
+        self._base_m = 0.0  # averaged difference between altimeter and climb [m]
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
@@ -112,7 +112,7 @@ class RangeEstimator(TargetEstimator):
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
         """Update with a box, as in :meth:`TargetEstimator.update`, and drop hypotheses that no longer fit.
 
-        The filters restart if the measured height jumps because someone walks under the vehicle, it flies over a table
+        The filters restart if the measured height jumps, because someone walks under the vehicle, it flies over a table
         or its height was unknown. Such apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:

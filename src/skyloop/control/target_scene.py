@@ -39,12 +39,12 @@ _FAR_BEHIND: Final = 1.3  # ratio of ranges above which an object is hidden by a
 _EARLIER_S: Final = 0.5  # time before a meeting at which velocities are not yet distorted by merging boxes
 _APART_S: Final = 0.6  # time after a separation at which velocities are known again
 _DIFFER_M_S: Final = 0.8  # minimum velocity difference before a meeting for telling two objects apart
-_TURNED: Final = 0.3  # fraction of that difference that, if reversed, shows that two objects were confused
+_TURNED: Final = 0.3  # reversed fraction of that difference at which two objects count as confused
 _KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different object
 _YOUNG_S: Final = 0.5  # the same for objects seen only once
 _CONFIRMED: Final = 3  # number of detections needed to confirm an object
 _OF_A_PART: Final = 1.0  # colour difference assumed for objects cut off by the image
-_SETTLED: Final = 8  # number of detections before an object can contest others; new ones may be two in one
+_SETTLED: Final = 8  # number of detections after which an object can contest others; new ones may be two in one
 _YOUNG: Final = 4.0  # extra cost for an object with few detections
 _WELL_KNOWN: Final = 15  # number of detections from which an object's colours are known
 _SURE: Final = 0.35  # minimum score of a detection that may be a new object
@@ -199,7 +199,7 @@ class Scene:
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
                         costs[i, j] = cost + _UNLIKE * unlike + (0.0 if thing.hits >= _SETTLED else _YOUNG)
-        shift = float(costs.min())  # the assignment minimises the sum, so any possible pair must cost less than none
+        shift = float(costs.min())  # the assignment minimises sums, so possible pairs must always be cheaper
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
         matched = {i for i, _ in pairs}
@@ -236,7 +236,7 @@ class Scene:
             self._met[pair] = one.number, other.number, one.earlier - other.earlier
 
     def _untangle(self, at_ns: int) -> None:
-        """Exchange two objects if they were confused, that is, if each now moves as the other did before they met.
+        """Exchange two objects if they were confused, which shows when each moves as the other did before they met.
 
         The vehicle's own motion affects both velocities equally, so it does not change their difference.
         """

@@ -64,7 +64,7 @@ class WaypointSettings:
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position and what to do about that; empty if it can."""
+    """Return why a vehicle can't be flown to a position and how to solve this; empty if it can."""
     if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
     yaw = feedback.yaw_rad
@@ -165,7 +165,7 @@ class DeadReckoning:
         self._listener = drone.on_feedback(self._take, inline=True)
 
     def __call__(self) -> Fix | None:
-        """Return the newest position; None before the first velocity and yaw."""
+        """Return the newest position; None until the vehicle has reported velocity and yaw."""
         return self._newest
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ from skyloop.motion_capture.source import RawFrame, System
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-LOOK_S: Final = 0.05  #: interval of checks for lost bodies
+LOOK_S: Final = 0.05  #: interval between checks for lost bodies
 EVENT_DEPTH: Final = 256  #: maximum number of events waiting for a slow callback
 MAX_UNKNOWN: Final = 1000  #: maximum number of names to remember for bodies that were not requested
 T = TypeVar("T")
@@ -57,9 +57,9 @@ MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callab
 class MotionCapture:
     """Poses of bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
 
-    Methods can be called from any thread. Each callback has a thread. With ``inline=True`` it runs on the receiving
-    thread (event callbacks also on the thread that checks for lost bodies) and must be quick. Exceptions in a callback
-    are counted and logged and do not affect other callbacks.
+    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True`` they run on the
+    receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. Exceptions in
+    callbacks are counted and logged and do not affect other callbacks.
 
     Attributes:
         system: The system.
@@ -142,7 +142,7 @@ class MotionCapture:
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns() - self.latency_ns)  # the thread with the checks may lag behind
+            track.look(monotonic_ns() - self.latency_ns)  # the watch thread may lag behind
             return track.pose
 
     def state(self, name: str) -> TrackState:
@@ -271,7 +271,7 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between a tracked body's axes and its drone's axes while it rests on the ground.
+        """Measure the rotation between a tracked body's axes and those of a drone that rests on the ground.
 
         Afterwards, poses of the body are those of the drone. Until then, an earlier calibration remains in force.
 

@@ -3,7 +3,7 @@
 The calibration is the rotation between a tracked body's axes, as defined by the system, and those of the drone. The
 procedure is that of MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if
 they vary too much. The drone's own roll and pitch determine its attitude at rest. Its nose must point along the world's
-x axis or have the heading ``heading``.
+x axis unless ``heading`` is given.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Track:
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body not seen yet; with ``may_freeze``, constant poses count, as in a noise-free simulator."""
+        """Initialise a body that has not been seen; ``may_freeze`` is for simulators without noise."""
         self.body = body
         self.state = TrackState.WAITING  #: whether the body is tracked
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None

@@ -115,7 +115,7 @@ def parse_system(address: str) -> System:
     port = _port_of_host(address, parts)
     if port is not None and kind == "optitrack":
         raise UsageError(f"{address!r}: give the port of OptiTrack's command channel as an option, ?port={port}")
-    if port is not None and kind == "qualisys":  # the package adds a base port
+    if port is not None and kind == "qualisys":  # the package adds this number to its base port
         settings.append(("port", str(port)))
         port = None
     latency_s = _latency(address, options)
@@ -271,7 +271,7 @@ def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[flo
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Command of the child, without ``-m``, which would warn that the package imports this module.
+#: Command of the child process. With ``-m``, Python would warn that the package has already imported this module.
 WORKER: Final = (
     sys.executable,
     "-c",
@@ -279,7 +279,7 @@ WORKER: Final = (
 )
 AGAIN_S: Final = 0.5  #: delay before restarting a child process that ended
 SILENT_S: Final = 3.0  #: time without frames after which a child is killed, because its system may have restarted
-FIRST_S: Final = 10.0  #: the same for a child's first frame
+FIRST_S: Final = 10.0  #: the same limit for a child's first frame
 
 
 class ChildSource:

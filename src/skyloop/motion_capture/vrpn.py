@@ -174,7 +174,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest pose for each body, given poses in order of arrival; the others as ``TRACKER:SENSOR``."""
+        """Return the newest pose of each body, given poses in order of arrival; others are named ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
