@@ -141,7 +141,7 @@ class OrbitMarker(FollowMarker):
         """
         require_positive(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
         if reach_rad > 1.1:
-            raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1: further aside, the marker is hidden")
+            raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1, to keep the marker visible")
         wanted = replace(settings or FollowSettings(aside_rad=0.05), distance_m=radius_m)
         super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
         self.turns = 0

@@ -42,7 +42,7 @@ class Behaviour(Controller):
     """
 
     name = "behaviour"  #: source of the annotations and prefix of event texts
-    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target, whose start is a warning
+    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target, reported as warnings
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.

@@ -132,7 +132,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Reduce the trust in the map to that at the start, and look at the gate again."""
+        """Trust the map no more than initially, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self.number)

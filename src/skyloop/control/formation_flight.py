@@ -235,7 +235,7 @@ class Formation:
             if not lacking(sample) and not sample.state.airborne
         ]
         if problems:
-            raise UsageError(f"these can't be flown in formation: {'; '.join(problems)}")
+            raise UsageError(f"these drones can't be flown in formation: {'; '.join(problems)}")
         return found
 
     def _check_ways(self, names: list[str], starts: Places, goals: Places) -> None:

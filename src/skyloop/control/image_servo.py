@@ -51,7 +51,7 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
     if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
         raise UsageError(f"points need shape (n, 2) and depths (n,), got {points.shape} and {depths.shape}")
     if not (np.isfinite(points).all() and np.isfinite(depths).all() and (depths > 0.0).all()):
-        raise UsageError("points must be finite, and depths above 0")
+        raise UsageError("points must be finite and depths above 0")
     x, y, z, none = points[:, 0], points[:, 1], 1.0 / depths, np.zeros(len(points))
     along_x = np.column_stack([-z, none, x * z, x * y, -(1.0 + x * x), y])
     along_y = np.column_stack([none, -z, y * z, 1.0 + y * y, -x * y, -x])
@@ -231,7 +231,7 @@ class ImageServo(Behaviour):
         require_positive(distance_m=distance_m)
         info = camera_info(drone, camera)
         if mounting_rotation(info)[0, 2] < 0.5:
-            raise UsageError(f"camera {info.name!r} does not look forward")
+            raise UsageError(f"camera {info.name!r} does not face forward")
         self.marker_id = marker_id
         self._wanted = rectangle(size_m, size_m)[:, :2] * (1.0, -1.0) / distance_m
         self._servo_law = ImageServoLaw(info, self._wanted, distance_m, settings)
@@ -397,7 +397,7 @@ class FlowHover(Behaviour):
             MissingExtraError: OpenCV is not installed.
         """
         if "attitude" not in drone.capabilities.actions:
-            raise UsageError("this vehicle does not fly by attitude")
+            raise UsageError("this vehicle does not accept attitude set-points")
         self._flow_law = FlowLaw(settings)
         super().__init__(drone, self._flow_law, camera)
         self._tracker = GroundTracker(self._mounting)

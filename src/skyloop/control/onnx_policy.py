@@ -143,7 +143,7 @@ class PolicyNetwork:
         if memory.shape != self._blank.shape:
             raise FileFormatError(
                 f"{self._path} takes {MEMORY} as {self._blank.shape} and gives {NEXT_MEMORY} as {memory.shape}: "
-                "they must be alike"
+                "the two must match"
             )
         # Non-finite values would stay in the memory forever.
         self._memory = memory if np.isfinite(memory).all() else self._blank

@@ -120,7 +120,7 @@ class PathSettings:
         numbers = (*_MAY_BE_ZERO, "leash_m", "near_m", "near_rad")
         require_positive(_MAY_BE_ZERO, **{name: getattr(self, name) for name in numbers})
         if self.gains.d > 0.0:
-            raise UsageError(f"gains.d is {self.gains.d!r} and must be 0: velocity_gain damps")
+            raise UsageError(f"gains.d is {self.gains.d!r} and must be 0, because velocity_gain provides damping")
 
     def within(self, limits: Mapping[str, Value]) -> PathSettings:
         """Return these settings clamped to a drone's limits, because higher speeds would wind up the integral.

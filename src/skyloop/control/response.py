@@ -79,12 +79,12 @@ class VelocityResponse:
         self._push = np.zeros(2)
         self._trim = np.zeros(2)
         self._lean = np.zeros(2)  # acceleration caused by the lean
-        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # for velocity and push, per axis
+        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # covariance of velocity and push
 
     def add(self, feedback: Feedback) -> None:
         """Update with the next sample; ignore it if it lacks velocity or attitude or is not newer than the last one.
 
-        If it is over half a second older than the last one, that one's time was wrong, and the model restarts.
+        The model restarts if the sample is over half a second older than the last, whose time must have been wrong.
         """
         if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return

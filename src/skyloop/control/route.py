@@ -62,7 +62,7 @@ class Look(_Part, frozen=True, tag_field="do", tag="look"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.yaw is None) == (self.at is None):
-            raise UsageError("look needs a yaw, or a point to look at: give one of yaw and at")
+            raise UsageError("look needs either a yaw or a point to look at: give one of yaw and at")
 
 
 class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
@@ -203,7 +203,7 @@ class Conditions:
 class Finding(msgspec.Struct, frozen=True):
     """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: number, from 1; for a leg, that of its end; None for the whole route
+    waypoint: int | None  #: number from 1 (for a leg, of its end point), or None for the whole route
     severity: Literal["error", "warning"]
     reason: str
 
@@ -260,7 +260,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
     """Check a route against a drone's newest feedback and parameters; waits for the proxy's answer.
 
-    An observer's connection is enough. It waits up to ``wait_s`` for the first position.
+    An observer's connection is enough. The check waits up to ``wait_s`` for the first position.
     """
     feedback = None
     with suppress(LinkError):  # missing feedback becomes a finding
@@ -321,9 +321,9 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
         warning(None, "the battery's charge is unknown: can't check whether it lasts")
     elif left < c.battery_land:
         minutes = f"{seconds / 60:.1f} minutes of the {c.flight_time_s / 60:g} of a full battery (battery.flight_time)"
-        error(None, f"the battery ends below {c.battery_land:.0%}, where the vehicle lands: the route takes {minutes}")
+        error(None, f"the battery falls below {c.battery_land:.0%} and the vehicle lands: the route takes {minutes}")
     elif left < c.battery_warn:
-        warning(None, f"the battery ends at about {left:.0%}, below {c.battery_warn:.0%} (battery.warn)")
+        warning(None, f"the battery ends up at about {left:.0%}, below {c.battery_warn:.0%} (battery.warn)")
     return RouteCheck(tuple(found), length_m, seconds, None if left is None else max(0.0, left))
 
 

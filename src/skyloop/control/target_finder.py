@@ -184,7 +184,7 @@ class TargetFinder:
         ]
 
     def _shift(self, camera: Camera, captured_ns: int) -> None:
-        """Shift the tracker by the image motion to expect from rotation, flight and the target's own motion."""
+        """Shift the tracker by the image motion expected from rotation, flight and the target's own motion."""
         if self.estimator is None or self._middle is None:
             return
         middle = camera.pixel(self.estimator.at(captured_ns).middle)

@@ -79,7 +79,7 @@ class TargetFollower(AirframeLaw):
     ) -> None:
         """Initialise the follower; raise UsageError if there is no target or the camera does not face forward."""
         if mounting_rotation(camera)[0, 2] < 0.5:
-            raise UsageError(f"camera {camera.name!r} does not look forward, as following needs")
+            raise UsageError(f"camera {camera.name!r} does not face forward, as is required for following")
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
         if box is None and detector is None and not detects:
@@ -323,7 +323,7 @@ class FollowTarget(Behaviour):
             class_name: Class whose largest object to follow if there is no box; requires a detector.
             distance_m: Horizontal distance to keep; None for the distance in the settings.
             bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
-                ahead of it, π behind it. If None, the settings decide, which by default allow any side.
+                ahead of it, π behind it. If None, the settings apply, which allow any side by default.
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Detector that searches every frame, or the name of a processor whose results are detections, such
                 as that of ``skyloop detect``. If None, the target is tracked by appearance only.
@@ -347,7 +347,7 @@ class FollowTarget(Behaviour):
         if mode not in list(FollowMode):
             raise UsageError(f"mode is {mode!r} and must be one of {', '.join(FollowMode)}")
         if detector is not None and not isinstance(detector, str | ObjectDetector):
-            raise UsageError(f"detector is {detector!r} and needs a detect(image) method, or must name a processor")
+            raise UsageError(f"detector is {detector!r} and must have a detect(image) method or name a processor")
         self.follower = TargetFollower(
             camera_info(drone, camera),
             box=None if box is None else _box(box),

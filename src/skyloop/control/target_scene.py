@@ -236,7 +236,7 @@ class Scene:
             self._met[pair] = one.number, other.number, one.earlier - other.earlier
 
     def _untangle(self, at_ns: int) -> None:
-        """Exchange two objects if they were confused, which shows when each moves as the other did before they met.
+        """Exchange two objects that were confused: each now moves as the other did before they met.
 
         The vehicle's own motion affects both velocities equally, so it does not change their difference.
         """

@@ -64,7 +64,7 @@ class WaypointSettings:
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position and how to solve this; empty if it can."""
+    """Return why a vehicle can't be flown to a position, with a remedy; empty if it can."""
     if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
     yaw = feedback.yaw_rad

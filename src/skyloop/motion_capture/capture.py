@@ -82,7 +82,7 @@ class MotionCapture:
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
             raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
-            raise UsageError(f"bodies is {bodies!r} and must not give one body two names")
+            raise UsageError(f"bodies is {bodies!r} and must not map two names to one body")
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
@@ -288,7 +288,7 @@ class MotionCapture:
         name = drone.name
         self.wait(name)
         if drone.feedback().state.airborne:
-            raise UsageError(f"{name} is flying: a calibration needs it at rest on the ground")
+            raise UsageError(f"{name} is flying: land it before calibrating it")
         poses = self._measured[name] = []
         try:
             if self._ended.wait(seconds):

@@ -166,7 +166,7 @@ def calibrate(
     spread_rad = math.sqrt(sum(angle * angle for angle in angles) / len(angles))
     if spread_m > max_spread_m or spread_rad > max_spread_rad:
         raise UsageError(
-            f"the poses spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
+            f"the poses spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, but at most "
             f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: keep the drone still"
         )
     stands = quaternion_from_euler(roll, pitch, heading)
