@@ -113,7 +113,7 @@ class Airframe:
 
         Args:
             feedback: The new sample; non-finite values count as missing. If it is several seconds older than the last
-                one, the history restarts, because that one had a time in the future or the proxy's clock was set back.
+                one, the history restarts, because the last one's time was wrong or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:

@@ -286,7 +286,7 @@ class ChaseLaw:
         )
 
     def _steer(self, velocity: Array, turn: float, state: TargetState | None, now: _Now) -> Velocity | Attitude:
-        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate; it also controls the height."""
+        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, including height control."""
         up = self._up(now.altitude_m, state)
         if now.relative:
             return self._by_attitude(now.ahead, velocity, up, turn)

@@ -66,7 +66,7 @@ class CourseSettings:
     body_m: float = 0.27  #: the vehicle's radius
     clearance_m: float = 0.2  #: clearance in addition to the radius
     frame_m: float = 0.12  #: thickness of a gate's bars along and across the axis
-    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening to try, in order
+    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening, in the order to try them
     views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances for a gate that has not been seen yet
     beyond_m: float = 0.45  #: distance behind the gate at which the gate counts as passed
     aligned_m: float = 0.12  #: maximum lateral and vertical offset from the axis

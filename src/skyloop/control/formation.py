@@ -121,7 +121,7 @@ def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
         yaw: Rotation about z, counter-clockwise [rad].
 
     Raises:
-        UsageError: An argument is not finite or has the wrong number of dimensions or elements.
+        UsageError: An argument is not finite or has the wrong shape.
     """
     middle = np.asarray(at, dtype=np.float64)
     if middle.shape != (3,) or not np.isfinite(middle).all() or not math.isfinite(yaw):
@@ -207,7 +207,7 @@ def kept_apart(
         positions: Positions in world axes, (n, 3) [m].
         apart_m: The minimum allowed distance.
         gain: Rate of separation per metre of missing distance [1/s].
-        fixed: Number of drones at the end of the list that don't yield because something else steers them.
+        fixed: Number of drones at the end of the list that are not steered here and therefore don't yield.
 
     Returns:
         The changed velocities, (n, 3) [m/s].

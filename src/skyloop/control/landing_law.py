@@ -234,7 +234,7 @@ class LandingLaw(AirframeLaw):
         self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the marker's centre in body axes, (3,) [m]; ignore it if attitude or motion are unknown.
+        """Update with the marker's centre in body axes, (3,) [m]; ignore it if attitude or motion is unknown.
 
         The attitude in ``at_capture`` is used; if it is older than the frame, it is extrapolated using the turn rate.
         """

@@ -95,7 +95,7 @@ class VelocityResponse:
         lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * GRAVITY_M_S2)
         before_ns = self._at_ns
         if before_ns is not None and seconds(before_ns - feedback.captured_ns) > _LONGEST_PREDICTION_S:
-            before_ns = None  # the last sample had a time in the future and would hide all samples until then
+            before_ns = None  # the last sample's time was in the future and would hide all samples until then
             self._setpoints.clear()
         self._at_ns = max(feedback.captured_ns, before_ns or 0)
         if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:

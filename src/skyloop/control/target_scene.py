@@ -199,7 +199,7 @@ class Scene:
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
                         costs[i, j] = cost + _UNLIKE * unlike + (0.0 if thing.hits >= _SETTLED else _YOUNG)
-        shift = float(costs.min())  # the assignment minimises sums, so possible pairs must always be cheaper
+        shift = float(costs.min())  # the assignment minimises sums, so impossible pairs must be the most expensive
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
         matched = {i for i, _ in pairs}
