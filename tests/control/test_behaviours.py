@@ -260,7 +260,7 @@ def test_invalid_arguments_are_refused() -> None:
         with pytest.raises(UsageError, match="distance_m"):
             ImageServo(drone, 7, distance_m=0.0)
     with rehearse("sim://?world=empty&cameras=bottom") as drone:
-        with pytest.raises(UsageError, match="does not look forward"):
+        with pytest.raises(UsageError, match="does not face forward"):
             ImageServo(drone, 7, camera="bottom")
         assert FlowHover(drone).off_m is None
 

@@ -129,7 +129,7 @@ def test_invalid_arguments_are_refused() -> None:
         ({"class_name": "person"}, "needs a detector"),
         ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
         ({"box": box, "mode": None}, "mode is None"),
-        ({"box": box, "detector": 7}, "detector is 7 and needs a detect"),
+        ({"box": box, "detector": 7}, "detector is 7 and must have a detect"),
         ({"box": (math.nan, 1, 20, 20)}, "must consist of finite numbers"),
         ({"box": (1, 2, 3)}, "must be x, y, width and height"),
         ({"box": "here"}, "must be x, y, width and height"),
@@ -138,7 +138,7 @@ def test_invalid_arguments_are_refused() -> None:
         ({"box": box, "distance_m": math.nan}, "distance_m is nan"),
         ({"box": box, "bearing_rad": math.inf}, "bearing_rad is inf"),
         ({"box": box, "height_m": -1.0}, "height_m is -1.0"),
-        ({"box": box, "camera": "bottom"}, "does not look forward"),
+        ({"box": box, "camera": "bottom"}, "does not face forward"),
     ]
     with rehearse("sim://?world=empty&cameras=front,bottom") as drone:
         for given, why in bad:
@@ -472,5 +472,5 @@ def test_a_camera_must_look_forward_with_a_known_mounting() -> None:
     with pytest.raises(UsageError, match="mounted"):
         TargetFollower(CameraInfo("front", 320, 240, 15.0), box=the_box())
     down = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
-    with pytest.raises(UsageError, match="'bottom' does not look forward"):
+    with pytest.raises(UsageError, match="'bottom' does not face forward"):
         TargetFollower(CameraInfo("bottom", 320, 240, 15.0, rotation=down), box=the_box())

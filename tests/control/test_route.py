@@ -138,7 +138,7 @@ def places(*points: tuple[float, float, float], **more: Any) -> Route:
         (places((1, 1, 1), speed=3.0), HERE, [(1, "flown at 2 m/s")]),
         (places((1, 1, 1)), Conditions(problem="no position", battery=1.0), [(None, "no position")]),
         (places((1, 1, 1)), Conditions(start=(0, 0, 1)), [(None, "is unknown")]),
-        (places((3, 2, 1), (-3, 2, 1), speed=0.1), Conditions(start=(0, 0, 1), battery=0.2), [(None, "battery ends")]),
+        (places((3, 2, 1), (-3, 2, 1), speed=0.1), Conditions(start=(0, 0, 1), battery=0.2), [(None, "battery falls")]),
         (places((1, 1, 1)), Conditions(start=(0, 0, 1), battery=0.2), [(None, "at about 19%, below 20%")]),
         (places((1, 2, 1), (3.5, 0, 1), end="return"), HERE, [(2, "on the way back, a no-fly zone")]),
     ],

@@ -1,14 +1,14 @@
-"""A vehicle's motion, its age and its gaps, with base classes for the laws that fly by it. Pure.
+"""Tracking of a vehicle's recent motion, and base classes for the control laws that depend on it. Pure.
 
-Motion is in *odometry axes*: levelled, x along yaw 0, z up, origin at the first sample. The origin drifts with the
-error of the reported velocity. That does no harm because the laws use only differences over about a second. The origin
-may also have jumped after a gap (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
+Motion is given in *odometry axes*: levelled, x along yaw 0, z up, origin at the first sample. Errors of the reported
+velocity make the origin drift, which is harmless because the laws only use differences over about a second. The origin
+may also jump after a gap (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
 
 A vehicle that holds its height but reports no velocity accelerates by gravity times the tangent of its tilt, minus air
 drag. Integrating the attitude therefore gives its velocity through the air, and drag makes old errors fade within about
-two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences are still right, such as
-how much faster the vehicle is than its target. Holding a speed against the vehicle's own drag estimate also compensates
-for wind, as an integral term would, because that estimate is the averaged tilt.
+two seconds. Wind and an inaccurate drag constant cause a slowly changing error, so differences, such as the vehicle's
+speed relative to its target, are still accurate. Holding a speed against the vehicle's own drag estimate also
+compensates for wind, as an integral term would, because that estimate is the averaged tilt.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimiter, Setpo
 from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
-STALE_S: Final = 0.5  #: maximum age of a known value; after a longer gap the odometry may have jumped
-#: Drag on a small quadrotor at some metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
+STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
+#: Drag on a small quadrotor at a few metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (Engel, Sturm and
 #: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
-_HISTORY_S: Final = 3.0  # duration of the motion to keep
+_HISTORY_S: Final = 3.0  # length of the motion history
 _SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates
-_EXTRAPOLATE_S: Final = 0.3  # maximum time to extrapolate a motion
+_EXTRAPOLATE_S: Final = 0.3  # maximum time over which to extrapolate motion
 _TILTING_S: Final = 0.3  # time over which the tilt rate is measured
 _STEEPEST: Final = 0.5  # minimum cosine of the tilt; a vehicle that tilts more does not hold its height
 
 
 def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
-    """Return a sighting's time; None if it is later than now, because the sighting would count as fresh until then."""
+    """Return a sighting's time; None if it lies in the future, because the sighting would seem fresh until then."""
     return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
 
 
 class Part(StrEnum):
-    """A part of the vehicle's state that a law may need."""
+    """A part of the vehicle's state that a control law may need."""
 
     ATTITUDE = "attitude"
     YAW = "yaw"
@@ -64,21 +64,21 @@ class Motion:
     yaw_rate: float  #: [rad/s]
 
     def moved_to(self, at_ns: int) -> Motion:
-        """Return the motion extrapolated to another time, by at most 0.3 s forward or back."""
+        """Return the motion extrapolated to another time, at most 0.3 s forwards or backwards."""
         dt = clamped(seconds(at_ns - self.at_ns), _EXTRAPOLATE_S)
         yaw = wrap_angle(self.yaw + self.yaw_rate * dt)
         return Motion(at_ns, self.position + self.velocity * dt, self.velocity, yaw, self.yaw_rate)
 
     def to_body(self, horizontal: Array) -> tuple[float, float]:
-        """Convert a horizontal vector (2,) from odometry axes to forward and left of the levelled body."""
+        """Convert a horizontal vector (2,) from odometry axes to the levelled body's axes, forward and left."""
         return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
         """Add a fraction of the current velocity error to a wanted velocity.
 
         Args:
-            wanted: Shape (3,) in odometry axes [m/s].
-            share: Fraction of the difference between the wanted and the current velocity; 0 or more.
+            wanted: The wanted velocity in odometry axes, (3,) [m/s].
+            share: Fraction of the difference between the wanted and the current velocity to add; 0 or more.
         """
         return wanted + share * (wanted - self.velocity)
 
@@ -88,9 +88,9 @@ class Airframe:
 
     Attributes:
         feedback: The newest sample, with non-finite values removed; None before the first sample.
-        by_tilt: The vehicle reports no velocity; :class:`TiltVelocity` estimates it from the attitude.
+        by_tilt: Whether the vehicle reports no velocity, so that :class:`TiltVelocity` estimates it from the attitude.
         interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
-            axes from before a gap are off by the distance flown during it.
+            axes stored before such a gap are off by the distance flown during the gap.
     """
 
     def __init__(self, *needs: Part) -> None:
@@ -103,7 +103,7 @@ class Airframe:
         self.by_tilt = False
         self.interruptions = 0
         self._needs = needs
-        self._known: dict[Part, tuple[int, Any]] = {}  # time and value of each part
+        self._known: dict[Part, tuple[int, Any]] = {}  # time and value of each known part
         self._history: deque[Motion] = deque()
         self._reckoning = TiltVelocity()
         self._tilts: deque[tuple[int, float, float]] = deque()
@@ -112,8 +112,8 @@ class Airframe:
         """Update with the next sample; ignore it if it is not newer than the last one.
 
         Args:
-            feedback: Non-finite values count as missing. A sample that is older by seconds restarts the history,
-                because the previous one was stamped ahead or the proxy's clock was set back.
+            feedback: The new sample; non-finite values count as missing. If it is several seconds older than the last
+                one, the history restarts, because the last one's time was wrong or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
@@ -145,7 +145,7 @@ class Airframe:
         return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
-        """Return a sentence that names the needed parts of the state that are unknown now; empty if there are none."""
+        """Return a sentence naming the required parts of the state that are unknown now; empty if all are known."""
         old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
@@ -166,7 +166,7 @@ class Airframe:
 
     @property
     def newest(self) -> Motion | None:
-        """Motion from the last sample that reported it, whatever its age; None before the first one."""
+        """Motion from the last sample that contained it, regardless of its age; None before the first such sample."""
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
@@ -184,9 +184,9 @@ class Airframe:
         """Return the motion when a frame was captured, and the rotation (3, 3) from the body to odometry axes.
 
         Args:
-            frame: Feedback with the attitude at the time of capture.
+            frame: Feedback with the attitude at the time when the frame was captured.
             captured_ns: Capture time of the frame.
-            *seen: Measurements made in the frame.
+            *seen: Measurements from the frame.
 
         Returns:
             None if the motion or attitude is unknown or a measurement is not finite.
@@ -198,9 +198,9 @@ class Airframe:
 
     @property
     def tilt_rate_rad_s(self) -> float:
-        """Recent tilt rate, computed from differences for vehicles whose feedback has no gyroscope.
+        """Recent tilt rate, computed from differences because some vehicles report no gyroscope data.
 
-        The largest difference in roll or pitch over the last 0.3 s, divided by 0.15 s [rad/s].
+        Root sum square of the roll and pitch ranges over the last 0.3 s, divided by 0.15 s [rad/s].
         """
         if not self._tilts:
             return 0.0
@@ -211,7 +211,7 @@ class Airframe:
         return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
 
     def _begin_anew(self, at_ns: int) -> None:
-        """Restart the history at the last known position, because the vehicle is still somewhere near it."""
+        """Restart the history at the last known position, because the vehicle is still close to it."""
         self._known.clear()
         self._tilts.clear()
         self._reckoning = TiltVelocity()
@@ -243,14 +243,14 @@ class TiltVelocity:
             drag_per_s: Deceleration per unit of speed [1/s].
         """
         self.drag_per_s = drag_per_s
-        self._velocity = np.zeros(2)  # horizontal: along yaw 0 and to the left
+        self._velocity = np.zeros(2)  # horizontal components along yaw 0 and to the left of it
         self._last_ns: int | None = None
 
     def step(self, feedback: Feedback) -> tuple[float, float, float] | None:
         """Integrate the next sample.
 
         Args:
-            feedback: The vehicle's newest state; a landed vehicle counts as at rest.
+            feedback: The vehicle's newest state; a landed vehicle is taken to be at rest.
 
         Returns:
             The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None if the attitude is
@@ -273,22 +273,22 @@ class TiltVelocity:
 
 
 class AirframeLaw:
-    """Base class for laws that fly by the vehicle's motion and hold the vehicle while a needed part of it is unknown.
+    """Base class for control laws that hover while any part of the vehicle's state that they need is unknown.
 
     Attributes:
-        airframe: The known motion of the vehicle.
-        problem: Why the law held the vehicle at the last step; empty if it is flying it.
+        airframe: The recent motion of the vehicle.
+        problem: The reason for hovering at the last step; empty if the law is flying the vehicle.
     """
 
     def __init__(self, *needs: Part) -> None:
-        """Initialise the law.
+        """Initialise the control law.
 
         Args:
             *needs: Parts of the state that the law can't fly without.
         """
         self.airframe = Airframe(*needs)
         self.problem = ""
-        self._altitude: float | None = None  # at the last step; None if unknown
+        self._altitude: float | None = None  # altitude at the last step; None if unknown
         self._last_ns: int | None = None  # time of the last step
 
     def feedback(self, feedback: Feedback) -> None:
@@ -299,14 +299,14 @@ class AirframeLaw:
             self.forget()
 
     def pause(self) -> None:
-        """Restart from rest, because another client flew the vehicle or its motion was unknown."""
+        """Restart from rest after another client has flown the vehicle or its motion was unknown."""
         self._last_ns = None
 
     def forget(self) -> None:
         """Forget everything stored in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Return whether all needed parts are known; pause if not, or if the last set-point is too old."""
+        """Return whether all required parts of the state are known; pause if not, or if the last step was long ago."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
         if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
@@ -319,27 +319,27 @@ class AirframeLaw:
         return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the motion at a time. The caller has checked that it is known."""
+        """Return the motion at a time; the caller must have checked that it is known."""
         motion = self.airframe.at(at_ns)
         assert motion is not None, "a law without its motion is not ready"
         return motion
 
 
 class VelocityLaw(AirframeLaw):
-    """Base class for laws whose set-points are velocities with limits."""
+    """Base class for control laws whose set-points are velocities within limits."""
 
     def __init__(self, limits: SetpointLimits, *needs: Part) -> None:
-        """Initialise the law.
+        """Initialise the control law.
 
         Args:
-            limits: Limits of the set-points.
+            limits: Limits for the set-points.
             *needs: Parts of the state that the law can't fly without.
         """
         super().__init__(*needs)
         self._limiter = SetpointLimiter(limits)
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. It is zero while a part of the state that the law needs is unknown."""
+        """Compute the current set-point, which is zero while any required part of the state is unknown."""
         if not self._ready(now_ns):
             return Velocity()
         return self._limiter.step(self._setpoint(now_ns), self._since_s(now_ns))
@@ -378,7 +378,7 @@ def _finite(feedback: Feedback) -> Feedback:
 
 
 class TurningSearch:
-    """A search with a forward camera: turn on the spot and change the height after each full turn."""
+    """A search with a forward-facing camera: turns on the spot and changes the height after each full turn."""
 
     def __init__(
         self,
@@ -391,7 +391,7 @@ class TurningSearch:
 
         Args:
             turn_rad_s: Yaw rate.
-            heights_m: Height during each full turn, relative to the height at the start.
+            heights_m: Heights of successive full turns, relative to the height at the start.
             lowest_m: Minimum height above the ground.
             highest_m: Maximum height above the ground.
         """
@@ -407,7 +407,7 @@ class TurningSearch:
         """Start the next search in the direction in which the vehicle is already turning.
 
         Args:
-            turning: Yaw rate [rad/s], counter-clockwise positive; below 0.05 the previous direction is kept.
+            turning: Yaw rate [rad/s], positive counter-clockwise; below 0.05 the previous direction is kept.
         """
         if abs(turning) > 0.05:
             self._direction = math.copysign(1.0, turning)

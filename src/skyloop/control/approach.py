@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
-_LONGEST_STEP_S = 0.2  # longest time that moves the station along its arc after a gap between frames
+_LONGEST_STEP_S = 0.2  # maximum time step for moving the station along the arc after a gap between frames
 _LOOKING: Colour = (120, 190, 255)
 _SEEN: Colour = (64, 220, 100)
 
@@ -33,8 +33,8 @@ _SEEN: Colour = (64, 220, 100)
 class ApproachMarker(FollowMarker):
     """Finds a marker, flies to a point squarely in front of it and hovers there. Then :meth:`run` returns.
 
-    The goal counts as reached once distance and height have stayed within ``near_m``, and the angle to the marker's
-    normal within ``near_rad``, for ``hold_s``.
+    The goal counts as reached once the error of distance and height has stayed below ``near_m``, and the angle to the
+    marker's normal below ``near_rad``, for ``hold_s``.
     """
 
     name = "approach"
@@ -57,15 +57,15 @@ class ApproachMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Id of the marker.
-            distance_m: Distance at which to stop; overrides ``settings``.
-            near_m: Acceptance radius for distance and height together.
-            near_rad: Acceptance angle on either side of the marker's normal.
+            marker_id: ID of the marker.
+            distance_m: Distance from the marker at which to stop; overrides ``settings``.
+            near_m: Maximum combined error of distance and height.
+            near_rad: Maximum angle to either side of the marker's normal.
             hold_s: How long the vehicle must stay within both limits.
-            size_m: Edge of the marker's black square.
+            size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: Settings of the law; None for the defaults with ``aside_rad`` 0.
+            settings: Settings for the control law; None for the defaults with ``aside_rad`` 0.
 
         Raises:
             UsageError: A number is not finite and greater than 0.
@@ -100,10 +100,10 @@ class ApproachMarker(FollowMarker):
 class OrbitMarker(FollowMarker):
     """Swings back and forth on an arc in front of a marker while facing it (a flat marker can't be seen from behind).
 
-    It starts on the side from which it sees the marker, and runs until stopped.
+    It starts at the angle from which it first sees the marker, and runs until stopped.
 
     Attributes:
-        turns: Number of times the vehicle has reached an end of the arc.
+        turns: Number of times the vehicle has turned back at an end of the arc.
     """
 
     name = "orbit"
@@ -125,23 +125,23 @@ class OrbitMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Id of the marker.
+            marker_id: ID of the marker.
             radius_m: Distance from the marker; overrides ``settings``.
-            reach_rad: Half angle of the arc on either side of the marker's normal, at most 1.1.
+            reach_rad: Angle of the arc to either side of the marker's normal, at most 1.1.
             rate_rad_s: Angular rate around the marker.
-            size_m: Edge of the marker's black square.
+            size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: Settings of the law; None for the defaults with ``aside_rad`` 0.05.
+            settings: Settings for the control law; None for the defaults with ``aside_rad`` 0.05.
 
         Raises:
-            UsageError: A number is out of its range.
+            UsageError: A number is out of range.
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
         require_positive(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
         if reach_rad > 1.1:
-            raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1: further aside, the marker is hidden")
+            raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1, to keep the marker visible")
         wanted = replace(settings or FollowSettings(aside_rad=0.05), distance_m=radius_m)
         super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
         self.turns = 0
@@ -149,14 +149,14 @@ class OrbitMarker(FollowMarker):
         self._last_ns: int | None = None
 
     def on_frame(self, frame: Frame) -> None:
-        """Move the station along the arc while the marker is in sight, and follow the marker."""
+        """Move the station along the arc while the marker is in sight, and keep following the marker."""
         law = self._follow_law
         dt_s = 0.0 if self._last_ns is None else min(_LONGEST_STEP_S, seconds(frame.captured_ns - self._last_ns))
         self._last_ns = frame.captured_ns
         going = self.mode is Mode.FOLLOWING and law.aside_rad is not None
         law.station_rate_rad_s = self._rate if going else 0.0
         if law.aside_rad is not None and not going:
-            law.station_rad = law.aside_rad  # start from where the marker was found again
+            law.station_rad = law.aside_rad  # continue from where the marker was found again
         if abs(law.station_rad) >= self._reach and law.station_rad * self._rate > 0.0:
             self._rate = -self._rate
             self.turns += 1
@@ -165,9 +165,9 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Circles a position, facing it or away from it, and then hovers; :meth:`run` returns.
+    """Circles a position, facing it or facing away from it, and then hovers; :meth:`run` returns.
 
-    Needs the vehicle's position, as described for :class:`FollowPath`.
+    Requires the vehicle's position, like :class:`FollowPath`.
     """
 
     def __init__(
@@ -191,11 +191,11 @@ class OrbitPlace(FollowPath):
             look: Direction the vehicle faces: ``"in"`` (towards the centre) or ``"out"``.
             speed_m_s: Speed along the circle.
             laps: Number of laps, counter-clockwise.
-            settings: Settings of the path law; None for the defaults.
+            settings: Settings for the path law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         if look not in ("in", "out"):
             raise UsageError(f"look is {look!r} and must be 'in' or 'out'")
@@ -205,16 +205,16 @@ class OrbitPlace(FollowPath):
 
 
 class LandOnMarker(Behaviour):
-    """Searches for a marker on a spiral, flies over it, descends along with it and stops the motors after landing.
+    """Searches for a marker in a spiral, descends above it, following its motion, and stops the motors after landing.
 
-    If the marker is lost during the approach, the vehicle climbs where it expects the marker to be, then searches. Low
-    over the marker, where the image no longer shows all of it, the vehicle descends by the marker's predicted motion;
-    if it would miss, it aborts and tries again. After too many aborted attempts, or too long, it climbs to a safe
-    height and hovers, and :meth:`run` returns with :attr:`landed` false, also if another client lands it. The vehicle
-    must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
+    If the marker is lost during the approach, the vehicle climbs at its predicted position, then searches for it. When
+    the vehicle is so low that the marker no longer fits into the image, it descends by the marker's predicted motion;
+    if it would miss, it aborts and tries again. After too many aborts or too long a time, it climbs to a safe height
+    and hovers, and :meth:`run` returns with :attr:`landed` false, as it does if another client lands the vehicle. The
+    vehicle must be airborne when :meth:`run` is called; if :meth:`run` ends early, the vehicle hovers in place.
 
     Attributes:
-        marker_id: Id of the marker.
+        marker_id: ID of the marker.
     """
 
     name = "landing"
@@ -234,11 +234,11 @@ class LandOnMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Id of the marker.
-            size_m: Edge of the marker's black square.
+            marker_id: ID of the marker.
+            size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: A camera that looks down.
-            settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.
+            camera: A downward-facing camera.
+            settings: Settings for the control law; None for the defaults. Clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -265,7 +265,7 @@ class LandOnMarker(Behaviour):
         return self.done and self.phase is LandingPhase.DOWN
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the law and send its set-point; after touch-down, wait until the vehicle reports a landing."""
+        """Update the control law and send its set-point; after touch-down, wait for the vehicle to report a landing."""
         self._flew = self._flew or feedback.state.airborne
         down = self.phase is LandingPhase.DOWN
         if self._flew and feedback.state is FlightState.LANDED and not self.done:
@@ -274,20 +274,20 @@ class LandOnMarker(Behaviour):
             self.emit(text, Severity.INFO if down else Severity.WARNING)
             self._end()
         if down or self.done:
-            self._landing_law.feedback(feedback)  # another client may take over and fly the vehicle from here
+            self._landing_law.feedback(feedback)  # another client may still take over and fly the vehicle
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:
-            self.fly(self.drone.now_ns)  # on every sample rather than only on frames, to react to gusts sooner
+            self.fly(self.drone.now_ns)  # on every sample, not only on frames, to react to gusts sooner
 
     def on_frame(self, frame: Frame) -> None:
-        """Search the frame and end the behaviour if the law has given up."""
+        """Search the frame, and end the behaviour if the control law has given up."""
         super().on_frame(frame)
         if not self.done and self._landing_law.safe(frame.captured_ns):
             self.finish("gave up: hovering at a safe height", Severity.WARNING)
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the marker and update the law."""
+        """Detect the marker and update the control law."""
         law = self._landing_law
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None:
@@ -303,9 +303,9 @@ class LandOnMarker(Behaviour):
         return shapes
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send velocities until the law is down, then have the vehicle's own landing stop the motors."""
+        """Send velocities until touch-down, then stop the motors using the vehicle's own landing function."""
         if self.phase is LandingPhase.DOWN:
-            # Requested at every step, so that a brief loss of the link does not end the landing.
+            # The landing is requested at every step, so that it continues after a brief loss of the link.
             let_go(self.drone, "it has touched down on its marker", land=True)
         else:
             super().steer(wanted)

@@ -1,4 +1,4 @@
-"""The base class of ready-made behaviours, which detect something in images and follow a control law's set-points."""
+"""The base class for ready-made behaviours, which detect something in images and fly by a control law."""
 
 from __future__ import annotations
 
@@ -21,35 +21,35 @@ BLIND_S = 0.5  #: time without a frame after which the vehicle hovers
 
 
 class Law(Protocol):
-    """A behaviour's control law. Pure: no clock and no thread; times are on the proxy's clock [ns]."""
+    """The control law of a behaviour, pure logic without clocks or threads; times are on the proxy's clock [ns]."""
 
     def feedback(self, feedback: Feedback) -> None:
-        """Update the law with the vehicle's newest state."""
+        """Update the control law with the vehicle's newest state."""
 
     def step(self, now_ns: int) -> Velocity | Attitude:
-        """Compute the set-point for this time."""
+        """Compute the set-point for the current time."""
 
 
 class Behaviour(Controller):
-    """A controller that detects something in the camera's frames and flies by what it detects.
+    """A controller that flies by what it detects in camera frames.
 
     For each frame, :meth:`look` searches the image, the law computes a set-point, :meth:`steer` sends it, and the
     detections are drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne
-    when :meth:`run` is called. If frames stop for more than :data:`BLIND_S`, or a part of the vehicle's motion that the
-    law needs is unknown, the vehicle hovers and an event reports why.
+    when :meth:`run` is called. If no frames arrive for more than :data:`BLIND_S`, or a part of the vehicle's state that
+    the law needs is unknown, the vehicle hovers and an event gives the reason.
 
-    Subclasses define :meth:`look` and :attr:`phase`, and list phases without sight of the target in :attr:`losses`.
+    Subclasses define :meth:`look`, :attr:`phase` and, for phases without sight of the target, :attr:`losses`.
     """
 
-    name = "behaviour"  #: source of the annotations, and prefix of the events' text
-    losses: frozenset[StrEnum] = frozenset()  #: phases in which the target is out of sight; entering one is a warning
+    name = "behaviour"  #: source of the annotations and prefix of event texts
+    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target, reported as warnings
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.
 
         Args:
             drone: The drone to fly.
-            law: Computes the set-points.
+            law: The control law that computes the set-points.
             camera: Camera to use; None for the vehicle's first camera.
 
         Raises:
@@ -57,9 +57,9 @@ class Behaviour(Controller):
         """
         super().__init__(drone)
         self.camera = camera
-        self.done = False  #: the behaviour has reached its end
-        self.blind = False  #: the vehicle hovers because no frames arrive
-        self.problem = ""  #: missing part of the vehicle's state that makes it hover
+        self.done = False  #: whether the behaviour has ended
+        self.blind = False  #: whether the vehicle is hovering because no frames arrive
+        self.problem = ""  #: missing part of the vehicle's state that causes the hovering
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture time of the newest frame
@@ -71,7 +71,7 @@ class Behaviour(Controller):
         raise NotImplementedError
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target in a frame and update the law.
+        """Find the target in a frame and update the control law.
 
         Returns:
             The shapes to draw on the frame.
@@ -83,7 +83,7 @@ class Behaviour(Controller):
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        # abs(), because a frame stamped ahead would otherwise hide that frames have stopped.
+        # abs() is needed because a frame with a time in the future would otherwise hide that frames have stopped.
         if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
@@ -100,11 +100,11 @@ class Behaviour(Controller):
             self.emit("frames arrive again")
         shapes = self.look(frame)
         self.fly(frame.captured_ns + nanoseconds(frame.age_s))
-        with suppress(UsageError):  # a shape that can't be drawn must not end the flight
+        with suppress(UsageError):  # shapes that can't be drawn must not end the flight
             self.drone.annotate(frame, shapes, source=self.name)
 
     def fly(self, now_ns: int) -> None:
-        """Compute the law's set-point, send it and report a change of phase.
+        """Compute the control law's set-point, send it and report any change of phase.
 
         Args:
             now_ns: The current time on the proxy's clock.
@@ -139,10 +139,10 @@ class Behaviour(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def finish(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """End the behaviour permanently: publish an event, hover, and let :meth:`run` return.
+        """End the behaviour permanently: publish an event, hover and make :meth:`run` return.
 
         Args:
-            text: The result, added to the behaviour's name in the event's text.
+            text: The result, which follows the behaviour's name in the event text.
             severity: Severity of the event.
         """
         self.done = True
@@ -154,7 +154,7 @@ class Behaviour(Controller):
         """Publish an event to this application's event subscribers.
 
         Args:
-            text: Text, added after the behaviour's name and a colon.
+            text: Event text, which follows the behaviour's name and a colon.
             severity: Severity of the event.
         """
         self.drone.emit(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
@@ -168,7 +168,7 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Look up a camera in the vehicle's capabilities by its name, or take the first; UnknownNameError without one."""
+    """Return a camera of the vehicle by name, or its first; raise UnknownNameError if there is none."""
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

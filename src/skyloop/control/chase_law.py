@@ -1,10 +1,10 @@
-"""A law that keeps a target in view at a distance, or circles it. Pure: times are on the proxy's clock.
+"""A control law that keeps a target in view at a distance, or circles it. Pure; times are on the proxy's clock.
 
-Yaw keeps the target in the middle of the image, distance is controlled along the line of sight, and height and sideways
-motion separately. This is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
-object tracking and following for unmanned aerial vehicles", SSRR 2013), applied to estimated metres, so that the gains
-depend on neither lens nor target size, and with the target's velocity fed forward. A vehicle that reports no velocity
-is flown to the same velocity by attitude, using dead reckoning instead (:class:`.airframe.TiltVelocity`).
+Yaw keeps the target in the centre of the image, the distance is controlled along the line of sight, and height and
+sideways motion are controlled separately. This is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli
+("Vision based GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013). Here it is applied to
+distances in metres, so that the gains depend on neither lens nor target size, and the target's velocity is fed forward.
+Vehicles that report no velocity are flown by attitude with dead reckoning (:class:`.airframe.TiltVelocity`).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class FollowMode(StrEnum):
 class TargetPhase(StrEnum):
     """The phases of a pursuit."""
 
-    LOOKING = "looking for the target"  #: target not seen yet: turning on the spot
-    RANGING = "range not yet known: turns only"  #: target seen, but perhaps much closer than it seems
+    LOOKING = "looking for the target"  #: turning on the spot; the target has not been seen yet
+    RANGING = "range not yet known: turns only"  #: the target is in view but may be much closer than it seems
     FOLLOWING = "following"
     ORBITING = "orbiting"
     WATCHING = "looking at it"
@@ -67,29 +67,29 @@ class ChaseSettings:
     """Goals, gains and limits of :class:`ChaseLaw`.
 
     Raises:
-        UsageError: A number is out of its range, or ``distance_m`` is not greater than ``nearest_m``.
+        UsageError: A number is out of range, or ``distance_m`` is not greater than ``nearest_m``.
     """
 
     distance_m: float = 4.0  #: horizontal distance between the centres of the vehicle and the target
     nearest_m: float = 2.0  #: minimum distance to the target; the vehicle backs off from a target that comes closer
-    clear_m: float = 1.5  #: minimum distance to other objects that the detector sees
-    #: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is in front of it, π
-    #: behind it, π/2 on its left. None for the side that the vehicle is on.
+    clear_m: float = 1.5  #: minimum distance to other detected objects
+    #: Side of the target to stay on, as a counter-clockwise angle from its direction of motion: 0 is in front of the
+    #: target, π behind it and π/2 on its left. With None, the vehicle stays on the side that it is on.
     bearing_rad: float | None = None
-    orbit_m_s: float = 0.8  #: speed around the target; positive for counter-clockwise as seen from above
-    #: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches. None for no
-    #: leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
+    orbit_m_s: float = 0.8  #: speed around the target; positive is counter-clockwise as seen from above
+    #: Maximum horizontal distance from the start, not exceeded even to evade a target; None means no leash. It is
+    #: computed from the vehicle's position or, if unknown, from its integrated velocity, which drifts.
     leash_m: float | None = None
     height_m: float | None = None  #: height above the ground; None for the height at the start
     lowest_m: float = 0.8  #: minimum height above the ground
     highest_m: float = 4.0  #: maximum height above the ground
-    #: How far to rise (or sink, if it can't rise) and return in order to measure the range of a target that may not be
-    #: on the ground. None waits for the range without moving.
+    #: Distance to rise (or sink, if rising is impossible) and return in order to measure the range of a target that may
+    #: not be on the ground. With None, the vehicle waits for the range without moving.
     parallax_m: float | None = 0.4
-    #: maximum elevation of the target's middle, up or down, at which the vehicle keeps its height
+    #: maximum elevation of the target's centre, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
-    lead_s: float = 0.12  #: total delay of commands and feedback, from the decision until a command takes effect
-    response_s: float = 0.4  #: time to reach a commanded velocity, for which the target's velocity is predicted ahead
+    lead_s: float = 0.12  #: total delay of feedback and commands
+    response_s: float = 0.4  #: time to reach a commanded velocity; the target's velocity is predicted this far ahead
     range_gain: float = 1.0  #: [1/s]
     velocity_gain: float = 3.0  #: acceleration per unit of velocity error [1/s]
     yaw_gain: float = 2.2  #: [1/s]
@@ -99,20 +99,20 @@ class ChaseSettings:
     speed_m_s: float = 4.0
     climb_m_s: float = 0.6  #: maximum vertical speed
     turn_rad_s: float = 1.8  #: maximum yaw rate
-    #: limit of the horizontal set-point; more acceleration would tilt the camera off the target
+    #: horizontal acceleration limit for set-points; more would tilt the camera off the target
     acceleration_m_s2: float = 3.0
-    #: the vehicle's worst-case reaction time; limits the closing speed so that it can stop in time
+    #: worst-case reaction time of the vehicle; limits the closing speed so that it can stop in time
     react_s: float = 0.5
-    brake_m_s2: float = 1.5  #: deceleration assumed for that stop
+    brake_m_s2: float = 1.5  #: deceleration assumed for stopping in time
     tilt_rad: float = 0.33  #: maximum tilt of a vehicle flown by attitude
     tilt_gain: float = 3.0  #: acceleration per unit of velocity error of a vehicle flown by attitude [1/s]
-    lean_rad: float = 0.5  #: maximum lean that the model expects of a vehicle flown by velocity
+    lean_rad: float = 0.5  #: maximum lean that the model assumes for a vehicle flown by velocity
     seen_s: float = 0.4  #: time after the last sighting for which the target still counts as seen
     predict_s: float = 2.0  #: time to follow a hidden target's predicted motion while slowing down
-    hover_s: float = 4.0  #: time to hover after that, looking to either side of the target's predicted position
-    give_up_s: float = 25.0  #: time after the last sighting at which to give up
+    hover_s: float = 4.0  #: time to hover afterwards, looking to both sides of the target's predicted position
+    give_up_s: float = 25.0  #: time from the last sighting until giving up
     search_rad_s: float = 0.7  #: yaw rate during the search
-    sweep_rad: float = 0.6  #: angle to look past the target's predicted position while hovering
+    sweep_rad: float = 0.6  #: angle by which to look past the target's predicted position while hovering
 
     def __post_init__(self) -> None:
         free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m", "parallax_m"}
@@ -132,11 +132,11 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
     def within(self, limits: Mapping[str, Value]) -> ChaseSettings:
-        """Return these settings clamped to a drone's limits, so that the law never expects more than they allow.
+        """Return these settings clamped to a drone's limits, so that the law never expects more than is allowed.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
-                in ``drone.config``; a missing one sets no limit.
+                in ``drone.config``; missing ones have no effect.
         """
         highest = lowered(self.highest_m, limits, "limits.altitude")
         return replace(
@@ -151,21 +151,21 @@ class ChaseSettings:
         )
 
 
-_SMOOTHING_S = 0.4  # time constant of the target's acceleration
-_SETPOINT_OVER = 1.5  # set-point limit as a multiple of the top speed: drag keeps a vehicle below its set-point
-_SETPOINT_AHEAD = 4.0  # limit of the set-point's change, as a multiple of the vehicle's: to act, it must lead
-_APPROACH_HORIZON_S = 3.0  # give way to a target that will pass within this time
-_CONFIDENT_SIGMA_M = 0.35  # maximum deviation of a position that counts as certain
+_SMOOTHING_S = 0.4  # time constant for smoothing the target's acceleration
+_SETPOINT_OVER = 1.5  # set-point limit as a multiple of the top speed, because drag keeps a vehicle below its set-point
+_SETPOINT_AHEAD = 4.0  # limit on the set-point's change as a multiple of the vehicle's, because the set-point leads
+_APPROACH_HORIZON_S = 3.0  # time within which the vehicle gives way to an approaching target
+_CONFIDENT_SIGMA_M = 0.35  # maximum standard deviation for a position to count as certain
 _UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
-_KEEP_SIDE_S = 1.0  # time to stay on the side of the last evasion
-_HEAD_ON_SHARE = 0.2  # as a fraction of the clearance: a closer pass is head-on, and either side will do
-_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep on the side opposite to the target's motion
-_HEIGHT_REACHED_M = 0.1  # distance to a parallax height at which to head for the other one
-_ALONG_M_S = 0.4  # minimum speed of a target with a usable direction of motion
+_KEEP_SIDE_S = 1.0  # time for which evasion stays on the same side
+_HEAD_ON_SHARE = 0.2  # fraction of the clearance below which a pass is head-on, so that both sides are equally good
+_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep to the side opposite to the target's motion
+_HEIGHT_REACHED_M = 0.1  # distance from a parallax height at which the vehicle heads for the other one
+_ALONG_M_S = 0.4  # minimum speed for a target's direction of motion to be usable
 
 
 class _Now(NamedTuple):
-    """The inputs of a set-point computation."""
+    """The inputs for computing a set-point."""
 
     own: Motion
     ahead: Motion  #: motion when the set-point takes effect
@@ -179,47 +179,47 @@ class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state."""
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
-        """Initialise the law."""
-        self.settings = settings or ChaseSettings()  #: settings of the law; can be replaced in flight
-        self.mode = mode  #: mode of the pursuit; can be changed in flight
+        """Initialise the control law."""
+        self.settings = settings or ChaseSettings()  #: settings, which can be replaced in flight
+        self.mode = mode  #: pursuit mode, which can be changed in flight
         self.phase = TargetPhase.LOOKING  #: phase at the last step
-        #: estimated minus wanted distance at the last step; None while the target is not in sight
+        #: estimated minus wanted distance at the last step; None if the distance was not controlled
         self.off_m: float | None = None
-        self.held_by = ""  #: the constraint that keeps the vehicle from its goal ("leash"); empty if there is none
-        self._heading: float | None = None  # heading of the target's last motion
+        self.held_by = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
+        self._heading: float | None = None  # last known direction of the target's motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
         self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes
-        self._begin: Array | None = None  # position at the start, in world axes; None until it is known
+        self._begin: Array | None = None  # start position in world axes; None until known
         self._height: float | None = None
-        self._away = False  # whether the vehicle, while the range is unknown, is flying to the other height
+        self._away = False  # whether the vehicle is flying to the second parallax height
         self._since_ns: int | None = None  # start of the search
         self._direction = 1.0
-        self._sweep_first = 0.0  # side of the first sweep: 1 for left, 0 if not chosen yet
-        self._previous_velocity: tuple[int, Array] | None = None  # time and the target's velocity
+        self._sweep_first = 0.0  # side of the first sweep: 1 for left, -1 for right, 0 if not chosen yet
+        self._previous_velocity: tuple[int, Array] | None = None  # time and velocity of the target at the last step
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
         self._response = VelocityResponse(
             ResponseSettings(delay_s=self.settings.lead_s, tilt_rad=self.settings.lean_rad)
         )
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
-        self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and side of the last evasion
+        self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and direction of the last evasion
 
     def step(
         self,
         now_ns: int,  # the current time on the proxy's clock
-        motion: Motion,  # the vehicle's newest motion; from dead reckoning if ``relative``
+        motion: Motion,  # the vehicle's newest motion, from dead reckoning if ``relative``
         altitude_m: float | None,  # height above the ground; None leaves the height unchanged
         target: TargetEstimator | None,  # the target's filter; None before the first sighting
         seen_ns: int | None,  # time of the target's last certain or possible sighting; None if there was none
         others: Sequence[TargetState] = (),  # recently seen objects to keep clear of
         *,
         candidate: TargetState | None = None,  # a possible match for the lost target; the vehicle turns towards it
-        # the vehicle reports no velocity (see :class:`.airframe.TiltVelocity`), so the set-point is an attitude
+        # whether the vehicle reports no velocity (see :class:`.airframe.TiltVelocity`) and is flown by attitude
         relative: bool = False,
-        # the vehicle's position in world axes [m]; None if unknown: the leash then integrates velocity
+        # the vehicle's position in world axes [m]; without it, the leash relies on integrated velocity
         position: Vector | None = None,
     ) -> Velocity | Attitude:
-        """Compute the set-point for now."""
+        """Compute the current set-point."""
         s = self.settings
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
@@ -248,7 +248,7 @@ class ChaseLaw:
         turn = self._turn(ahead, state, aside, sweeping)
         if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
             return self._steer(still, turn, state, now)
-        # Full speed for half of ``predict_s``, then decreasing.
+        # The vehicle keeps its full speed for half of ``predict_s``, then slows down.
         fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
         if state.range_known:
             horizontal = self._horizontal(ahead, state) * max(0.0, fade)
@@ -263,16 +263,16 @@ class ChaseLaw:
         return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
-        """Update the model of the vehicle's response, except for vehicles that report no velocity and have no model."""
+        """Update the model of the vehicle's response, for vehicles that report their velocity."""
         self._response.add(feedback)
 
     def pause(self) -> None:
-        """Restart from the vehicle's own velocity, because another client flew it or its motion was unknown."""
+        """Restart from the vehicle's own velocity after another client flew it or its motion was unknown."""
         self._limiter, self._last_ns = None, None
         self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
-        """Return the vehicle's motion when a set-point sent now takes effect, given those already sent."""
+        """Return the vehicle's motion at the time when a set-point sent now takes effect, given those already sent."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
         if predicted is None:
@@ -286,14 +286,14 @@ class ChaseLaw:
         )
 
     def _steer(self, velocity: Array, turn: float, state: TargetState | None, now: _Now) -> Velocity | Attitude:
-        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, at the wanted height."""
+        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, including height control."""
         up = self._up(now.altitude_m, state)
         if now.relative:
             return self._by_attitude(now.ahead, velocity, up, turn)
         return self._by_velocity(velocity, up, turn, now)
 
     def _by_velocity(self, velocity: Array, up: float, turn: float, now: _Now) -> Velocity:
-        """Return the set-point that brings the vehicle to a velocity despite drag and wind."""
+        """Return the set-point that makes the vehicle reach a velocity despite drag and wind."""
         s, own = self.settings, now.own
         assert self._limiter is not None
         if now.predicted is not None:
@@ -324,9 +324,9 @@ class ChaseLaw:
         }[self.mode]
 
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
-        """Return the angle to the left of the target's expected position to look at [rad], and the rate of that angle.
+        """Return the angle [rad] by which to look to the left of the target's expected position, and its rate.
 
-        While hovering, sweep to both sides, first and furthest the way the target last moved; 0 in other phases.
+        While hovering, the vehicle looks to both sides, first and furthest in the target's last direction of motion.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -338,11 +338,11 @@ class ChaseLaw:
         back = _SWEEP_BACK_SHARE * s.sweep_rad
         whole = s.sweep_rad + back
         swept = (s.search_rad_s * (unseen_s - s.seen_s - s.predict_s) + back) % (2.0 * whole)
-        aside = self._sweep_first * (whole - abs(swept - whole) - back)  # a triangular wave
+        aside = self._sweep_first * (whole - abs(swept - whole) - back)  # triangular wave
         return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
 
     def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
-        """Return the yaw rate that points the vehicle at the target, or ``aside`` [rad] to the target's left."""
+        """Return the yaw rate that turns the vehicle towards the target, or ``aside`` [rad] to the left of it."""
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
@@ -367,9 +367,9 @@ class ChaseLaw:
         moving = self._soon(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
-            wanted = wanted - aside * s.orbit_m_s  # counter-clockwise from above, with the target on the left
+            wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above, with the target on the left
         elif s.bearing_rad is None:
-            # No side was chosen, so yaw alone follows the target's motion across the line of sight.
+            # With no side chosen, only the yaw follows the target's motion across the line of sight.
             wanted = wanted - aside * float(moving @ aside)
         else:
             wanted = wanted + aside * self._round(state, sight, across)
@@ -377,7 +377,7 @@ class ChaseLaw:
         return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
-        """Return the target's velocity, (2,) [m/s], predicted to the time when the vehicle has matched it."""
+        """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle has matched it."""
         s, velocity = self.settings, state.velocity
         if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
             dt_s = seconds(at_ns - self._previous_velocity[0])
@@ -390,7 +390,7 @@ class ChaseLaw:
         return velocity + s.response_s * change
 
     def _round(self, state: TargetState, sight: Array, across: float) -> float:
-        """Return the speed to the left of the line of sight that takes the vehicle to its side of the target."""
+        """Return the speed to the left of the line of sight that moves the vehicle to its side of the target."""
         s = self.settings
         if float(np.hypot(*state.velocity)) > _ALONG_M_S:
             self._heading = math.atan2(state.velocity[1], state.velocity[0])
@@ -401,7 +401,7 @@ class ChaseLaw:
         return -clamped(s.round_gain * off * across, 0.6 * s.speed_m_s)
 
     def _evading(self, own: Motion, state: TargetState) -> Array:
-        """Return the velocity, (2,) [m/s], that makes way for a target about to pass closer than allowed."""
+        """Return the velocity, (2,) [m/s], for evading a target that is about to pass closer than allowed."""
         s, velocity = self.settings, state.velocity
         speed = float(np.hypot(*velocity))
         if speed < _ALONG_M_S:
@@ -415,10 +415,10 @@ class ChaseLaw:
         return left * math.copysign(min(needed, 0.7 * s.speed_m_s), aside)
 
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
-        """Return the velocity, (2,) [m/s], that keeps clear of another object.
+        """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
-        Consider the closest pass both at the vehicle's current velocity and at the one it is about to take up. If the
-        other object's position is uncertain, for example out of view, stay further away and allow for it to stop.
+        The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
+        position is uncertain, for example out of view, the vehicle stays further away and is prepared for it to stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
@@ -445,7 +445,7 @@ class ChaseLaw:
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
     def _note_way(self, own: Motion, position: Vector | None) -> None:
-        """Track the offset from the start, by position if it is known, because the integral of the velocity drifts."""
+        """Track the offset from the start, using the position if known, because the integrated velocity drifts."""
         here = own.position[:2]
         self._out = self._out + (np.zeros(2) if self._previous_position is None else here - self._previous_position)
         self._previous_position = here
@@ -471,7 +471,7 @@ class ChaseLaw:
         return wanted - direction * (outwards - allowed)
 
     def _up(self, altitude_m: float | None, state: TargetState | None) -> float:
-        """Return the climb rate that keeps the height or brings the target back towards the image's centre."""
+        """Return the climb rate that keeps the height or moves the target back towards the image's centre."""
         s = self.settings
         if altitude_m is None:
             return 0.0
@@ -486,7 +486,7 @@ class ChaseLaw:
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _for_parallax(self, height: float, altitude_m: float) -> float:
-        """Return the next of the two heights that reveal the range, preferring to rise, because people may be below."""
+        """Return the next of two heights that reveal the range; rising is preferred because people may be below."""
         s = self.settings
         other = height = within(height, s.lowest_m, s.highest_m)
         if s.parallax_m is not None:
@@ -498,7 +498,7 @@ class ChaseLaw:
         return other if self._away else height
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
-        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s], and compensates for drag."""
+        """Return the attitude for accelerating to a velocity, (2,) in odometry axes [m/s], with drag compensation."""
         s = self.settings
         push = s.tilt_gain * (wanted - own.velocity[:2]) + DRAG_PER_S * own.velocity[:2]
         forward, left = own.to_body(shortened(push, GRAVITY_M_S2 * math.tan(s.tilt_rad)))
@@ -507,9 +507,9 @@ class ChaseLaw:
         )
 
     def _limits(self, own: Motion) -> None:
-        """Apply the settings' limits, and start the first set-point from the vehicle's own velocity."""
+        """Apply the limits in the settings, and start the first set-point from the vehicle's own velocity."""
         s = self.settings
-        # A set-point leads the velocity that it causes, so it may change faster than the vehicle does.
+        # Set-points lead the velocity, so they may change faster than the vehicle can accelerate.
         limits = SetpointLimits(
             _SETPOINT_OVER * s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2
         )
@@ -521,9 +521,9 @@ class ChaseLaw:
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
-    """Return the distance of the closest pass [m], the time to it [s] and the unit vector to the side to pass on, (2,).
+    """Return distance [m] and time [s] of the closest approach, and the unit vector towards the side to pass on.
 
-    ``here`` is the offset from the other object to the vehicle, ``moving`` the vehicle's velocity relative to it.
+    ``here`` is the vehicle's position relative to the other object, and ``moving`` its relative velocity.
     """
     square = float(moving @ moving)
     in_s = clamped(-float(here @ moving) / square, _APPROACH_HORIZON_S) if square > 0.01 else 0.0
@@ -534,12 +534,12 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
-    """Return the speed [m/s] from which the vehicle can stop within a gap after its reaction time; 0 without a gap."""
+    """Return the speed [m/s] from which the vehicle can stop within a gap, including its reaction time."""
     react_s, brake = settings.react_s, settings.brake_m_s2
     return brake * (math.sqrt(react_s**2 + 2.0 * max(0.0, gap_m) / brake) - react_s)
 
 
 def _not_towards(velocity: Array, sight: Array) -> Array:
-    """Remove the component towards a hidden target, because the obstacle that hides it may be in the way."""
+    """Remove the velocity component towards a hidden target, because the obstacle that hides it may be in the way."""
     direction = sight / max(1e-6, float(np.hypot(*sight)))
     return velocity - direction * max(0.0, float(velocity @ direction))

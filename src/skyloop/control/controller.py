@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from skyloop.messages import Event, Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
-_LOOK_S = 0.1  #: interval at which ``until`` is evaluated while no sample arrives
+_LOOK_S = 0.1  #: interval at which ``until`` is evaluated while no samples arrive
 _SAMPLES: Final = ("on_feedback", "on_frame", "on_result")
 _CALLBACKS: Final = (*_SAMPLES, "on_authority", "on_reload")
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Counts from one :meth:`Controller.run`, and why it ended."""
+    """Counts from one call of :meth:`Controller.run`, and the reason why it ended."""
 
     frames: int  #: number of ``on_frame`` calls
     feedback: int  #: number of ``on_feedback`` calls
@@ -62,14 +62,14 @@ class RunSummary:
 class Controller:
     """The base class for an application's control loop.
 
-    Override one or more of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`. Each
-    callback gets the newest sample, one call at a time, on the thread that called :meth:`run`; a sample that arrives
-    while a callback is running replaces the one that is waiting.
+    Override one or more of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`.
+    Callbacks run one at a time on the thread that called :meth:`run` and always get the newest sample: one that arrives
+    while a callback is running replaces any sample already waiting.
 
     Attributes:
         camera: Camera for :meth:`on_frame`; None for the vehicle's first camera.
         processors: Processors for :meth:`on_result`; None for all.
-        result_max_age_s: Maximum age of results; older ones are skipped. None skips none.
+        result_max_age_s: Maximum age of results; older ones are skipped. None disables the check.
         drone: The drone to fly.
     """
 
@@ -81,9 +81,9 @@ class Controller:
         """Store the drone; callbacks start with :meth:`run`."""
         self.drone = drone
         self._stopped = threading.Event()
-        self._ended = False  # permanently
+        self._ended = False  # whether the controller has ended permanently
         self._inbox: Mailboxes | None = None
-        self._checks: _Checks | None = None  # checks of the newest run
+        self._checks: _Checks | None = None  # checks for the latest run
 
     # Callbacks to override ------------------------------------------------------------------------------------------
 
@@ -112,7 +112,7 @@ class Controller:
         """
 
     def on_reload(self, before: Controller) -> None:
-        """Take over the state from the controller that this one replaces in flight.
+        """Take over the state of the controller that this one replaces in flight.
 
         Called once before the first sample when ``skyloop fly --reload`` reloads a saved file. Copy the previous
         controller's state here, for example ``self.target = before.target``.
@@ -131,7 +131,7 @@ class Controller:
             inbox.notifier.notify()
 
     def _is_overruled(self, feedback: Feedback) -> bool:
-        """Return whether another client, another controller or a failsafe has the vehicle, so set-points do nothing."""
+        """Return whether set-points are ignored because another client, controller or failsafe controls the vehicle."""
         return self.drone.authority.state != "held" or bool(feedback.others) or feedback.failsafe is not Failsafe.NONE
 
     def _end(self) -> None:
@@ -142,14 +142,14 @@ class Controller:
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
         """Call the callbacks until time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
-        An exception in a callback, Ctrl-C or ``sys.exit()`` makes an airborne vehicle hover, if this client flies it,
-        and propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the run:
-        instead, :meth:`on_authority` is called. A ready-made controller that has reached its end does not fly again:
-        its next run returns at once.
+        After an exception in a callback, Ctrl-C or ``sys.exit()``, an airborne vehicle flown by this client hovers, and
+        the exception propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the
+        run: instead, :meth:`on_authority` is called. Once a ready-made controller has finished, it does not fly again:
+        further runs end at once.
 
         Args:
             seconds: How long to run, 0 or more; None for no limit.
-            until: Function that is called before each round of callbacks, and every 0.1 s while no sample arrives.
+            until: Function called before each round of callbacks, and every 0.1 s while no samples arrive.
 
         Returns:
             Counts of calls and drops, the reason why the run ended, and likely mistakes.
@@ -217,7 +217,7 @@ class _Checks:
         self._flew = self._steered = False
 
     def look(self) -> None:
-        """Note whether the vehicle is airborne and receives set-points. Called throughout the run."""
+        """Record whether the vehicle is airborne and receives set-points; called throughout the run."""
         newest = self.known.newest
         self._flew = self._flew or (newest is not None and newest.state.airborne)
         if not self._steered and self._commands.intent > self._first_intent:
@@ -240,7 +240,7 @@ class _Checks:
                 yield f"{limit} limited set-points{often}: {applied:.3g} instead of {asked:.3g}"
 
     def _detectors(self) -> Iterator[Callable[[], str]]:
-        """Yield the functions that explain why a detector of the controller, its class or its file found nothing."""
+        """Yield functions that explain why detectors of the controller, its class or its file have found nothing."""
         own = type(self._controller)
         places = [vars(self._controller), *map(vars, own.__mro__), getattr(own.on_frame, "__globals__", {})]
         found = {id(value): value for place in places for value in list(place.values()) if not isinstance(value, type)}
@@ -249,7 +249,7 @@ class _Checks:
                 yield why.__get__(value)
 
     def _events(self) -> list[Event]:
-        """Return the events that concern this application, since the start of the run."""
+        """Return the events about this application since the start of the run."""
         events = self._controller.drone.recent_events()
         if self._last_event in events:
             del events[: events.index(self._last_event) + 1]
@@ -269,7 +269,7 @@ class _Run:
         self._feedback = 0
         self._results = 0
         self._overruns = 0
-        self._lost = False  # whether another client took over and on_authority was called
+        self._lost = False  # whether another client has taken over and on_authority has been called
 
     def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
         started_ns = self._inbox.clock()
@@ -308,11 +308,11 @@ class _Run:
         return "until" if until is not None and until() else None
 
     def _ended(self) -> bool:
-        """Return whether the vehicle closed its link deliberately, like a replay, and all samples were handled."""
+        """Return whether the vehicle closed its link on purpose, as replays do, and all samples have been handled."""
         return self._drone.link.vehicle is LinkState.CLOSED and not self._inbox.waiting
 
     def _serve(self) -> None:
-        """Call one callback per kind of waiting sample, feedback first, so that frames meet the newer state."""
+        """Call one callback for each kind of waiting sample, feedback first so that frames see the latest state."""
         feedback = self._inbox.feedback.take()
         if feedback is not None:
             self._feedback += 1
@@ -347,7 +347,7 @@ class _Run:
         except AuthorityError:
             status = self._drone.authority
             if status.state == "none":
-                raise  # no takeover: this application never acquired authority, or released it
+                raise  # not a takeover: this application never acquired authority or has released it
             if not self._lost and status.state != "held":
                 self._lost = True
                 self._controller.on_authority(status)

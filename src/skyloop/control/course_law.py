@@ -1,8 +1,8 @@
-"""A law that flies a course with a known map, corrected by the camera's sightings. Pure: no clock, no thread.
+"""A control law that flies a course by a map and corrects the map with camera sightings. Pure.
 
-The map gives the positions of gates and poles. The vehicle knows its own position only by odometry from its start. Each
-gate that it sees corrects the offset between map and odometry, and each pole is moved to where it is seen. The route to
-the next gate leads around poles and other gates to a point in front of the opening, then along the gate's axis.
+The map contains the positions of gates and poles. The vehicle's own position is only known by odometry from its start.
+Each gate seen corrects the offset between map and odometry, and each pole seen is moved to its observed position. The
+route to the next gate leads around poles and other gates to a point in front of the opening, then along its axis.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
 _SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
-_TILT_RAD = 0.012  # standard deviation of an elevation, from errors of the attitude and of a pole's top in the image
-_REPEATED = 3.0  # factor on the noise, because errors repeat from one sighting to the next
-_SIDES = 3  # number of viewing directions: along a gate's axis and from either side of it
+_TILT_RAD = 0.012  # standard deviation of elevations, due to errors of the attitude and of pole tops in the image
+_REPEATED = 3.0  # factor for the noise, because errors repeat from one sighting to the next
+_SIDES = 3  # number of viewing directions: along a gate's axis and from either side
 
 
 class GatePlace(NamedTuple):
-    """A gate's position on the map: the centre of its opening [m], and the heading for flying through it [rad]."""
+    """A gate's position on the map: the centre of its opening [m] and the heading for flying through [rad]."""
 
     x_m: float
     y_m: float
@@ -54,7 +54,7 @@ class CourseSettings:
     The defaults suit a vehicle half a metre across and openings of 1.2 m.
     """
 
-    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
+    lead_s: float = 0.12  #: delay between computing a command and its effect
     velocity_gain: float = 1.0  #: fraction of the velocity error added to the set-point
     cruise_m_s: float = 0.8
     climb_m_s: float = 0.5
@@ -65,16 +65,16 @@ class CourseSettings:
     yaw_gain: float = 1.8  #: [1/s]
     body_m: float = 0.27  #: the vehicle's radius
     clearance_m: float = 0.2  #: clearance in addition to the radius
-    frame_m: float = 0.12  #: thickness of a gate's bars, ahead and across
-    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening; the first free one is used
-    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances for a gate that was not seen yet
-    beyond_m: float = 0.45  #: distance behind the gate at which it counts as passed
-    aligned_m: float = 0.12  #: maximum offset from the axis, sideways and in height
-    map_m: float = 0.05  #: standard deviation of the map, horizontally and in height
+    frame_m: float = 0.12  #: thickness of a gate's bars along and across the axis
+    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening, in the order to try them
+    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances for a gate that has not been seen yet
+    beyond_m: float = 0.45  #: distance behind the gate at which the gate counts as passed
+    aligned_m: float = 0.12  #: maximum lateral and vertical offset from the axis
+    map_m: float = 0.05  #: standard deviation of map positions, horizontal and vertical
     start_m: float = 0.2  #: standard deviation of the start position
-    sightings: int = 3  #: number of sightings of a gate needed before flying through it
-    waiting_s: float = 2.5  #: waiting time at each viewpoint; if the gate can't be seen from any, the law is stuck
-    braking_per_s: float = 1.3  #: speed towards an obstacle per metre of space beyond half the clearance
+    sightings: int = 3  #: number of sightings of a gate required before flying through it
+    waiting_s: float = 2.5  #: waiting time at each viewpoint; after the last one, the law is stuck
+    braking_per_s: float = 1.3  #: maximum speed towards an obstacle per metre of distance beyond half the clearance
     plan_s: float = 0.4  #: interval between route plans
 
 
@@ -89,19 +89,19 @@ class CourseLaw(VelocityLaw):
         start: Point = (0.0, 0.0),
         settings: CourseSettings | None = None,
     ) -> None:
-        """Initialise the law; ``start`` is the map position, and the map's yaw that at the first feedback."""
+        """Initialise the control law; ``start`` is the vehicle's position on the map at the first feedback."""
         self.settings = s = settings or CourseSettings()
         super().__init__(
             SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),
             Part.VELOCITY,
             Part.HEIGHT,
         )
-        #: Phase, and the vehicle's position in the gate's axes, at the last step.
+        #: Phase and position of the vehicle in the gate's axes at the last step.
         self.phase, self.axis = GatePhase.SEARCHING, Axis(0.0, 0.0, 0.0)
         self.way: list[Point] = []  #: the points of the route, in odometry axes
-        self.stuck: str | None = None  #: why the vehicle can't continue; None while it can
+        self.stuck: str | None = None  #: reason why the vehicle can't continue; None if it can
         self._gates, self._widths = tuple(gates), tuple(widths_m)
-        self._shift = np.array([-start[0], -start[1], 0.0])  # from map axes to odometry axes
+        self._shift = np.array([-start[0], -start[1], 0.0])  # offset from map axes to odometry axes
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
         self.number = 0  #: number of the next gate, from 0
@@ -112,7 +112,7 @@ class CourseLaw(VelocityLaw):
         self._begin_gate(0)
 
     def next_gate(self) -> None:
-        """Advance to the next gate. The measured position of the last one corrects the others."""
+        """Advance to the next gate; the measured position of the last one corrects the map."""
         if self._seen >= self.settings.sightings:
             learnt = self._gate_at(self.number) - self._nominal(self.number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
@@ -132,7 +132,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Trust the map only as much as at the start, and look at the gate again."""
+        """Trust the map no more than initially, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self.number)
@@ -147,7 +147,7 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the next gate, as in :meth:`GateLaw.see`; ignore it if the gate can't be there."""
+        """Update with a sighting of the next gate, as in :meth:`GateLaw.see`; ignore impossible positions."""
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None or self._lift is None or self.number >= len(self._gates):
             return
@@ -157,7 +157,7 @@ class CourseLaw(VelocityLaw):
         across = across / max(1e-6, float(np.linalg.norm(across)))
         if float(across @ self._heading) < 0.0:  # a gate looks the same from behind
             across = -across
-        # The visible opening ends at the far edges of the bars, which are half their thickness behind the middle.
+        # The visible opening ends at the far edges of the bars, half their thickness behind the gate's centre.
         seen = to_level @ position
         off = float(across @ seen[:2]) / max(distance, 1e-6) * self.settings.frame_m / 2
         middle = motion.position + seen - np.array([*(off * across), 0.0])
@@ -172,7 +172,7 @@ class CourseLaw(VelocityLaw):
         self._seen += 1
 
     def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the direction of a pole's top in body axes, (3,); ignore it if no pole can be there."""
+        """Update with the direction of the top of a pole in body axes, (3,); ignore it if it matches no pole."""
         found = self.airframe.at_capture(at_capture, captured_ns, top)
         if found is None or self._lift is None or not self._poles:
             return
@@ -187,7 +187,7 @@ class CourseLaw(VelocityLaw):
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the vehicle's motion, including its height above the ground."""
+        """Return the vehicle's motion, with z as the height above the ground."""
         motion = super()._motion(at_ns)
         return replace(motion, position=motion.position + np.array([0.0, 0.0, self._lift or 0.0]))
 
@@ -250,7 +250,7 @@ class CourseLaw(VelocityLaw):
                 self.stuck = "the gate is not seen where it should be"
 
     def _kept_off(self, velocity: Array, place: Array, walls: Sequence[Wall]) -> Array:
-        """Limit a horizontal velocity's components towards obstacles."""
+        """Limit the components of a horizontal velocity towards obstacles."""
         s = self.settings
         for wall in walls:
             away = place - np.array(_nearest(place, wall))
@@ -277,12 +277,12 @@ class CourseLaw(VelocityLaw):
         far = float(np.linalg.norm(aim))
         rest = far + sum(math.dist(a, b) for a, b in zip(self.way[:-1], self.way[1:], strict=True))
         speed = min(self.settings.cruise_m_s, 1.0 * rest)
-        if len(self.way) > 1:  # slower around a corner
+        if len(self.way) > 1:  # slow down for corners
             speed = min(speed, 0.35 + 0.8 * far)
         return aim * (speed / max(far, 1e-6))
 
     def _plan(self, own: Motion, walls: Sequence[Wall], now_ns: int) -> None:
-        """Plan the route to the point in front of the gate, at most once every ``plan_s``."""
+        """Plan the route to a point in front of the gate, at most once every ``plan_s``."""
         s = self.settings
         if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
             return
@@ -349,12 +349,12 @@ class CourseLaw(VelocityLaw):
         ]
 
 
-#: Offset in standard deviations, offset from the pole's estimated position, (2,) [m], and its noise, (2, 2) [m²].
+#: A sighting's distance from a pole in standard deviations, its offset, (2,) [m], and its noise, (2, 2) [m²].
 _Sighting = tuple[float, Array, Array]
 
 
 class _Spot:
-    """A pole's estimated position and its covariance: a Kalman filter for a fixed point in two dimensions."""
+    """A pole's estimated position and covariance, from a Kalman filter for a fixed point in two dimensions."""
 
     def __init__(self, place: Array, pole: Pole, settings: CourseSettings) -> None:
         self.place, self.radius_m, self._height = place, pole.radius_m, pole.height_m
@@ -369,7 +369,7 @@ class _Spot:
         self.place = self.place + by
 
     def sighting(self, own: Array, ahead: Array, rise: float) -> _Sighting:
-        """Compare the bearing and slope of a pole's top with this estimate: a higher top is closer."""
+        """Compare the bearing and slope of a pole's top with this estimate; a steeper slope means a closer pole."""
         height = self._height - float(own[2])
         if rise * height <= 0.01 or abs(height) < 0.2:
             return math.inf, np.zeros(2), np.eye(2)
@@ -389,12 +389,12 @@ class _Spot:
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:
-    """Return a position's distance to the nearest wall minus the required one [m]; negative if too close."""
+    """Return a position's distance to the nearest wall minus the required distance [m]; negative if too close."""
     return min((math.dist(place, _nearest(place, wall)) - wall.reach_m for wall in walls), default=math.inf)
 
 
 def _nearest(place: Array, wall: Wall) -> Point:
-    """Return the point of a wall nearest to a position."""
+    """Return the point on a wall nearest to a position."""
     (x, y), (u, v) = wall.begin, wall.end
     along, aside = u - x, v - y
     share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)

@@ -1,4 +1,4 @@
-"""Filters for signals sampled at uneven times: low pass, complementary, median. Pure: the time step is an argument."""
+"""Low-pass, complementary and median filters for irregularly sampled signals. Pure; the time step is an argument."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Signal = TypeVar("Signal", float, NDArray[np.float64])
 
 
 class LowPass(Generic[Signal]):
-    """First-order low pass for a number or an array, exact for a signal that is constant between samples.
+    """A first-order low-pass filter for a number or array, exact for signals that are constant between samples.
 
-    From ``T·y' + y = x`` with ``x`` constant over a step ``dt``: ``y ← y + (1 − exp(−dt/T))·(x − y)`` (zero-order
-    hold; Åström and Wittenmark, "Computer-Controlled Systems", 1997, section 2.3).
+    Solving ``T·y' + y = x`` with ``x`` constant over a step ``dt`` gives ``y ← y + (1 − exp(−dt/T))·(x − y)``
+    (zero-order hold; Åström and Wittenmark, "Computer-Controlled Systems", 1997, section 2.3).
 
     Attributes:
-        time_constant_s: Time constant; can be changed at any time. 0 passes every sample unchanged.
+        time_constant_s: Time constant, which can be changed at any time; with 0, every sample passes unchanged.
         value: The filtered value; None before the first sample, which passes unchanged.
     """
 
@@ -41,7 +41,7 @@ class LowPass(Generic[Signal]):
 
     @classmethod
     def from_cutoff(cls, frequency_hz: float) -> LowPass[Signal]:
-        """Create a low pass from its cutoff frequency (−3 dB): ``T = 1 / (2π·f)``.
+        """Create a low-pass filter from its cutoff frequency (−3 dB): ``T = 1 / (2π·f)``.
 
         Raises:
             UsageError: The frequency is not greater than 0.
@@ -72,18 +72,18 @@ class LowPass(Generic[Signal]):
 
 
 class Complementary:
-    """Fuses an angle's rate, which responds at once but drifts, with its measurement, which is correct in the long run.
+    """Fuses an angle's rate, which responds at once but drifts, with measurements that are correct in the long run.
 
-    The rate passes a high pass and the angle a low pass with the same time constant; the two add up to one (Higgins, "A
-    Comparison of Complementary and Kalman Filtering", IEEE Trans. AES 11(3), 1975). Angles [rad] are wrapped, so that
-    crossing ±π counts as a small step.
+    The rate goes through a high-pass filter and the angle through a low-pass filter with the same time constant, so
+    that their gains add up to one (Higgins, "A Comparison of Complementary and Kalman Filtering", IEEE Trans. AES
+    11(3), 1975). Angles [rad] are wrapped, so crossing ±π counts as a small step.
     """
 
     def __init__(self, time_constant_s: float, angle: float | None = None) -> None:
         """Initialise the filter.
 
         Args:
-            time_constant_s: The rate dominates over shorter times than this, the measured angle over longer ones.
+            time_constant_s: Time constant: below it the rate dominates, above it the measured angle.
             angle: Initial angle; None starts from the first measurement.
 
         Raises:
@@ -97,7 +97,7 @@ class Complementary:
 
         Args:
             rate: Rate over the last ``dt_s`` [rad/s].
-            measured: The angle at the end of ``dt_s`` [rad]; None if not measured.
+            measured: The measured angle at the end of ``dt_s`` [rad]; None if there is none.
             dt_s: Time since the last sample.
 
         Returns:
@@ -114,9 +114,9 @@ class Complementary:
 
 
 class Median:
-    """The median of a number's last samples, which removes single outliers and keeps edges sharp.
+    """The median of the last samples of a number, which removes single outliers and keeps edges sharp.
 
-    For an even number of samples it is the lower of the two middle ones, so the result is always one of the samples.
+    The result is always one of the samples; for an even number, it is the lower of the middle two.
     """
 
     def __init__(self, length: int = 5) -> None:
@@ -139,7 +139,7 @@ class Median:
 
 
 def gain(time_constant_s: float, dt_s: float) -> float:
-    """Return the fraction of a step that a first-order filter follows within ``dt_s``: ``1 − exp(−dt/T)``."""
+    """Return the fraction of a step that a first-order filter covers within ``dt_s``: ``1 − exp(−dt/T)``."""
     if dt_s <= 0.0:
         return 0.0
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0.0 else 1.0

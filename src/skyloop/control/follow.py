@@ -1,10 +1,10 @@
-"""Follow a marker by camera at a distance, squarely in front of it, and search for it while it is out of view.
+"""Follow a marker using a camera, staying squarely in front of it, and search for it while it is out of view.
 
-The law is pure and turns sightings and feedback into velocities. It is position-based visual servoing (Chaumette and
-Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006): the marker's pose is levelled by the attitude when
-the image was captured and placed using the vehicle's position at that time. A filter predicts it to the time when the
-command takes effect. The vehicle keeps its height and its distance along the line of sight, and moves around the
-marker if it sees it from too far to the side.
+The control law is pure and computes velocities from sightings and feedback. It uses position-based visual servoing
+(Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006). The marker's pose is converted to
+odometry axes using the vehicle's attitude and position when the image was captured, and a filter predicts it for the
+time when the command takes effect. The vehicle keeps its height and its distance along the line of sight, and moves
+around the marker if it sees the marker from too far to the side.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Mode(StrEnum):
     """The phases of :class:`FollowLaw`."""
 
     SEARCHING = "searching"  #: turning on the spot at a series of heights
-    FOLLOWING = "following"  #: marker seen a moment ago
-    RECOVERING = "recovering"  #: marker lost: turning to its predicted position
+    FOLLOWING = "following"  #: the marker was seen a moment ago
+    RECOVERING = "recovering"  #: the marker is lost; turning to its predicted position
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +43,22 @@ class FollowSettings:
     """Goals, gains and limits of :class:`FollowLaw`. The defaults suit a small indoor vehicle with velocity control."""
 
     distance_m: float = 1.5
-    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
+    lead_s: float = 0.12  #: delay between computing a command and its effect
     range_gain: float = 1.1  #: [1/s]
     height_gain: float = 1.2  #: [1/s]
     yaw_gain: float = 2.2  #: [1/s]
-    #: Fraction of the velocity error added to the set-point, which stiffens a soft velocity loop against gusts.
+    #: Fraction of the velocity error added to the set-point, to stiffen a soft velocity loop against gusts.
     velocity_gain: float = 0.7
-    aside_gain: float = 1.2  #: gain of moving around to the marker's front [1/s]
-    aside_rad: float = 0.3  #: the vehicle stays in place within this angle of its station
+    aside_gain: float = 1.2  #: gain for moving around to the front of the marker [1/s]
+    aside_rad: float = 0.3  #: maximum angle from the station at which the vehicle stays in place
     speed_m_s: float = 1.2  #: maximum horizontal speed
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
-    acceleration_m_s2: float = 2.0  #: limit of the set-point; more acceleration would tilt the camera off the marker
-    following_s: float = 0.35  #: time after the last sighting that still counts as following
+    acceleration_m_s2: float = 2.0  #: limit for set-points; more would tilt the camera off the marker
+    following_s: float = 0.35  #: time after the last sighting for which the marker counts as followed
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
-    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: heights relative to the first one, one per full turn
+    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: relative heights for successive turns
     lowest_m: float = 0.6
     highest_m: float = 2.2
 
@@ -67,16 +67,16 @@ class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
         self.mode = Mode.SEARCHING  #: phase at the last step
-        #: Wanted angle around the marker from its normal, counter-clockwise from above [rad], and its rate [rad/s].
+        #: Wanted angle around the marker, counter-clockwise from its normal as seen from above [rad].
         self.station_rad = 0.0
-        self.station_rate_rad_s = 0.0  #: rate of that angle
-        self.off_m: float | None = None  #: error of distance and height at the last step; None while searching
-        self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
+        self.station_rate_rad_s = 0.0  #: rate of change of ``station_rad``
+        self.off_m: float | None = None  #: combined error of distance and height at the last step; None while searching
+        self.aside_rad: float | None = None  #: actual angle around the marker; None while its normal is unknown
         self._target = TargetFilter()
         self._face: Array | None = None  # horizontal part of the marker's normal, in odometry axes
         self._seen_ns: int | None = None
@@ -89,15 +89,15 @@ class FollowLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting; ignore it if the vehicle's attitude or motion is unknown.
 
-        The marker's centre, (3,) [m], and its face's normal are in body axes at the capture time, whose attitude is
-        that of ``at_capture``. ``trust`` is the confidence in the normal, 0 to 1.
+        The position of the marker's centre, (3,) [m], and its normal are in body axes at the time of capture, and
+        ``at_capture`` contains the attitude at that time. ``trust`` is the confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        # A constant corner error in pixels causes a range error that grows with the square of the range.
+        # With a constant corner error in pixels, the range error grows with the square of the range.
         self._target.see(motion.position + to_level @ position, 0.015 + 0.01 * distance**2, captured_ns)
         face = (to_level @ normal)[:2]
         weight = 0.25 * trust
@@ -117,16 +117,16 @@ class FollowLaw(VelocityLaw):
         return wanted
 
     def _follow(self, own: Motion, unseen_s: float) -> Array:
-        """Return the wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
+        """Return the wanted forward, left and up velocity [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
-        # Once the marker is lost, translation fades out within a second while turning continues.
+        # After losing the marker, the vehicle stops moving within a second but keeps turning.
         fade = within(1.0 - (unseen_s - s.following_s), 0.0, 1.0)
         place, speed = self._target.at(own.at_ns)
         speed = speed * fade
         offset = place - own.position
         across = max(0.3, math.hypot(offset[0], offset[1]))
         sight = offset[:2] / across
-        aside = np.array([-sight[1], sight[0]])  # to the left of the line of sight
+        aside = np.array([-sight[1], sight[0]])  # unit vector to the left of the line of sight
         away = float(np.linalg.norm(offset)) - s.distance_m
         self.off_m = math.hypot(away, float(offset[2]))
         horizontal = speed[:2] + sight * (s.range_gain * away) + aside * self._come_round(sight, across)
@@ -140,12 +140,12 @@ class FollowLaw(VelocityLaw):
         return np.array([*own.to_body(velocity[:2]), up, clamped(turn, s.turn_rad_s)])
 
     def _come_round(self, sight: Array, across: float) -> float:
-        """Return the speed [m/s] to the left of the line of sight that takes the vehicle to its station."""
+        """Return the speed [m/s] to the left of the line of sight that moves the vehicle to its station."""
         s = self.settings
-        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # faces up or down, or estimates averaged out
+        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # facing up or down, or estimates cancel out
             self.aside_rad = None
             return 0.0
-        # Angle from the marker-to-vehicle direction to the marker's normal, counter-clockwise.
+        # Compute the counter-clockwise angle from the direction to the vehicle to the marker's normal.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)
@@ -161,13 +161,13 @@ class FollowLaw(VelocityLaw):
 
 
 class TargetFilter:
-    """Filters the position and velocity of a point seen intermittently, and restarts after a jump."""
+    """Filters the position and velocity of a point that is seen intermittently; restarts after jumps."""
 
     def __init__(self) -> None:
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        """Update with a measured position (3,) [m] of a standard deviation; ignore it if it is older than the last one.
+        """Update with a measured position (3,) [m] and its standard deviation; ignore it if older than the last one.
 
         The filter restarts after two seconds without a sighting, or if the target is more than a metre (and five
         standard deviations) away from its prediction.
@@ -179,7 +179,7 @@ class TargetFilter:
             self._filter.update(position, deviation_m, at_ns)
 
     def at(self, at_ns: int, *, longest_s: float = 1.0) -> tuple[Array, Array]:
-        """Predict the target's position (3,) [m] and velocity (3,) [m/s]; UsageError if it was never seen."""
+        """Predict the target's position (3,) [m] and velocity (3,) [m/s]; raise UsageError if it was never seen."""
         estimate = self._filter.at(at_ns, longest_s=longest_s)
         return estimate.position, estimate.velocity
 
@@ -201,13 +201,13 @@ _OTHER: Colour = (150, 150, 150)
 
 @dataclass(slots=True)
 class FollowScore:
-    """Quality of a pursuit from the first sighting on. Ranges are estimates measured from the vehicle's centre."""
+    """Quality of a pursuit from the first sighting onwards; ranges are estimates from the vehicle's centre."""
 
-    frames: int = 0  #: number of frames since the first sighting, inclusive
+    frames: int = 0  #: number of frames from the first sighting onwards
     in_view: int = 0  #: number of these frames that showed the marker
     frames_before: int = 0  #: number of frames before the first sighting
     first_seen_ns: int | None = None  #: capture time of the first frame that showed the marker
-    ranges: list[tuple[int, float]] = field(default_factory=list)  #: capture time [ns] and error [m] of each sighting
+    ranges: list[tuple[int, float]] = field(default_factory=list)  #: time [ns] and range error [m] of each sighting
 
     @property
     def share_in_view(self) -> float | None:
@@ -215,12 +215,12 @@ class FollowScore:
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Return estimated minus wanted distance for each sighting, starting ``after_s`` after the first one."""
+        """Return the estimated minus the wanted distance for each sighting from ``after_s`` after the first one."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
     def count(self, captured_ns: int, range_error_m: float | None) -> None:
-        """Count a frame, with the estimated minus the wanted distance; None if it did not show the marker."""
+        """Count a frame; ``range_error_m`` is the estimated minus the wanted distance, or None without a sighting."""
         if range_error_m is not None:
             if self.first_seen_ns is None:
                 self.first_seen_ns = captured_ns
@@ -235,10 +235,10 @@ class FollowScore:
 class FollowMarker(Behaviour):
     """Finds a marker and follows it. The vehicle must be airborne when :meth:`run` is called.
 
-    Every frame is annotated with the markers in it.
+    Markers found in a frame are drawn on it as annotations.
 
     Attributes:
-        marker_id: Id of the followed marker.
+        marker_id: ID of the followed marker.
         score: Quality of the pursuit.
     """
 
@@ -259,11 +259,11 @@ class FollowMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Id of the marker.
-            size_m: Edge of the marker's black square.
+            marker_id: ID of the marker.
+            size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: Settings of the law; None for the defaults.
+            settings: Settings for the control law; None for the defaults.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -282,7 +282,7 @@ class FollowMarker(Behaviour):
 
     @property
     def phase(self) -> Mode:
-        """Same as :attr:`mode`, under the name that all behaviours use."""
+        """The same as :attr:`mode`, under the name common to all behaviours."""
         return self.mode
 
     @property
@@ -291,14 +291,14 @@ class FollowMarker(Behaviour):
         return self._follow_law.settings.distance_m
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the marker, update the law and count the frame."""
+        """Detect the marker, update the control law and count the frame."""
         seen = self._detector.detect(frame)
         mine = next((one for one in seen if one.id == self.marker_id), None)
         self.score.count(frame.captured_ns, None if mine is None else self._use(mine, frame))
         return self._drawing(frame, seen, mine)
 
     def _use(self, sighting: MarkerSighting, frame: Frame) -> float:
-        """Update the law and return the estimated minus the wanted distance [m]."""
+        """Update the control law and return the estimated minus the wanted distance [m]."""
         place = sighting.position_in_body(self._mounting)
         if frame.feedback is not None:
             normal = sighting.normal_in_body(self._mounting)

@@ -1,6 +1,6 @@
-"""Formation shapes, assignment of drones to positions, and a check of how close flying drones come. Pure.
+"""Formation shapes, assignment of drones to positions, and checks of the distances between flying drones. Pure.
 
-A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on their mean.
+A formation shape is a float64 array (n, 3) of positions in metres: x ahead, y left, z up, centred on the origin.
 :func:`placed` converts it to world axes (ROS REP 103).
 """
 
@@ -27,8 +27,8 @@ class Approach(NamedTuple):
     """The closest approach between any two of several drones."""
 
     distance_m: float  #: infinite if there are fewer than two drones
-    first: int  #: index of one of the two drones
-    second: int  #: index of the other one
+    first: int  #: index of one drone of the pair
+    second: int  #: index of the other drone
 
 
 def line(n: int, spacing_m: float) -> Places:
@@ -76,15 +76,15 @@ def circle(n: int, spacing_m: float) -> Places:
 
 
 def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
-    """Return a V like that of geese: the first drone in front, the others behind it, alternately left and right.
+    """Return a V formation with the first drone in front and the others behind it, alternately left and right.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours on one leg.
-        angle: Angle between the legs [rad], π/3 to π; a smaller angle would bring the legs closer than the spacing.
+        angle: Angle between the legs [rad], π/3 to π; at smaller angles, drones on different legs would be too close.
 
     Raises:
-        UsageError: An argument is out of its range.
+        UsageError: An argument is out of range.
     """
     _check(n, spacing_m=spacing_m)
     if not math.pi / 3 - 1e-9 <= angle <= math.pi:
@@ -95,15 +95,15 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
 
 
 def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
-    """Return a grid of rows with the first drone in front on the left.
+    """Return a grid of rows with the first drone at the front left.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours in a row and between rows.
-        columns: Number of drones in a row; None makes the grid as square as possible.
+        columns: Number of drones per row; None makes the grid as square as possible.
 
     Raises:
-        UsageError: An argument is out of its range.
+        UsageError: An argument is out of range.
     """
     _check(n, spacing_m=spacing_m)
     wide = math.ceil(math.sqrt(n)) if columns is None else columns
@@ -116,12 +116,12 @@ def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
     """Turn a shape and move it into world axes.
 
     Args:
-        shape: Shape (n, 3) [m].
-        at: Position for the shape's middle, (3,) in world axes [m].
+        shape: The formation shape, (n, 3) [m].
+        at: World position of the shape's centre, (3,) [m].
         yaw: Rotation about z, counter-clockwise [rad].
 
     Raises:
-        UsageError: The shape, the position or the yaw is not finite or has a wrong shape.
+        UsageError: An argument is not finite or has the wrong shape.
     """
     middle = np.asarray(at, dtype=np.float64)
     if middle.shape != (3,) or not np.isfinite(middle).all() or not math.isfinite(yaw):
@@ -134,7 +134,7 @@ def places(values: ArrayLike) -> Places:
     """Convert to an array of positions.
 
     Raises:
-        UsageError: A coordinate is not finite, or the shape is not (n, 3).
+        UsageError: A coordinate is not finite, or an array does not have shape (n, 3).
     """
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -146,15 +146,15 @@ def places(values: ArrayLike) -> Places:
 
 
 def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
-    """Return the slot index of each start for the assignment with the smallest sum of squared distances.
+    """Assign drones to slots so that the sum of squared distances is minimal; return the slot index for each start.
 
-    With this assignment, the straight paths of drones that leave and arrive together do not cross. The drones stay
-    apart by at least 1/√2 of the smallest distance between two starts or two slots (Turpin, Michael and Kumar, "CAPT",
-    International Journal of Robotics Research 33, 2014).
+    With this assignment, the straight paths of drones that leave and arrive together do not cross. The distance between
+    drones never falls below 1/√2 of the smallest distance between two starts or two slots (Turpin, Michael and Kumar,
+    "CAPT", International Journal of Robotics Research 33, 2014).
 
     Args:
-        starts: Shape (n, 3) [m].
-        slots: Shape (m, 3) [m], with m from n to :data:`MOST`.
+        starts: Start positions, (n, 3) [m].
+        slots: Positions to assign, (m, 3) [m]; m is at least n and at most :data:`MOST`.
 
     Raises:
         UsageError: There are fewer slots than starts, too many slots, or non-finite coordinates.
@@ -171,14 +171,14 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
 
 
 def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
-    """Return the closest approach of drones that all fly straight from start to goal in the same time.
+    """Return the closest approach between drones that fly straight from start to goal, all in the same time.
 
     Args:
-        starts: Shape (n, 3) [m].
-        goals: Shape (n, 3) [m].
+        starts: Start positions, (n, 3) [m].
+        goals: Goal positions, (n, 3) [m].
 
     Raises:
-        UsageError: A coordinate is not finite, or the shape is not (n, 3).
+        UsageError: A coordinate is not finite, or an array does not have shape (n, 3).
     """
     a, b = places(starts), places(goals)
     nearest = Approach(math.inf, 0, 0)
@@ -198,26 +198,26 @@ def kept_apart(
 ) -> Places:
     """Change velocities so that drones closer together than ``apart_m`` separate.
 
-    The distance between two such drones is made to grow by ``gain`` times the missing distance, with each drone
-    contributing half. A drone that meets one that doesn't yield makes the whole change, and approaches at no more than
-    ``gain`` times the distance beyond ``apart_m``. Components across the line between the drones are unchanged.
+    Their distance grows at a rate of ``gain`` times the missing distance, and each drone contributes half of that. If
+    one of them doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the
+    distance beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
 
     Args:
-        velocities: Shape (n, 3), world axes [m/s].
-        positions: Shape (n, 3), world axes [m].
+        velocities: Velocities in world axes, (n, 3) [m/s].
+        positions: Positions in world axes, (n, 3) [m].
         apart_m: The minimum allowed distance.
-        gain: [1/s]
-        fixed: Number of drones at the end of the list that don't yield because others fly them.
+        gain: Rate of separation per metre of missing distance [1/s].
+        fixed: Number of drones at the end of the list that are not steered here and therefore don't yield.
 
     Returns:
-        The changed velocities, shape (n, 3).
+        The changed velocities, (n, 3) [m/s].
 
     Raises:
-        UsageError: A number is not finite, or the shape is not (n, 3).
+        UsageError: A number is not finite, or an array does not have shape (n, 3).
     """
     changed, at = places(velocities).copy(), places(positions)
     free = len(at) - fixed
-    # Drones that do not yield come last, so that no later change can undo the separation from them.
+    # Drones that do not yield come last, so that later changes can't undo the separation from them.
     for j in range(1, len(at)):
         for i in range(min(j, free)):
             between = at[i] - at[j]

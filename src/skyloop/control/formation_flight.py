@@ -1,4 +1,4 @@
-"""Formation flight of a swarm, by the world positions that its drones report."""
+"""Formation flight of a swarm, based on the world positions reported by its drones."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from skyloop.client import Swarm
     from skyloop.client.swarm import Tick
 
-MAX_AGE_S: Final = 1.0  #: maximum age of feedback used for steering
-SLACK_S: Final = 10.0  #: default time allowed beyond a flight's planned duration
+MAX_AGE_S: Final = 1.0  #: maximum age of feedback that is used for steering
+SLACK_S: Final = 10.0  #: default allowance beyond the planned duration of a flight
 _PEAK: Final = 1.875  # ratio of peak to mean speed of a minimum-jerk trajectory
 
 
@@ -38,15 +38,15 @@ class FormationReport:
     slots: dict[str, Vector]  #: planned final position of each drone, in world axes [m]
     errors_m: dict[str, float]  #: distance of each drone from its slot
     closest_m: float  #: smallest distance between any two drones; infinite for a single drone
-    spread_s: float | None  #: maximum time between the first and the last set-point of a tick
+    spread_s: float | None  #: maximum time between the first and last set-points of a tick
 
 
 class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
-    Each drone must be airborne and report position and yaw. The swarm's ``on_error`` policy handles drones that fail
-    during the flight, for example because their position is unknown for half a second. All other drones keep clear of a
-    failed drone's last known position, and of any drone in the swarm that this flight does not steer.
+    Each drone must be airborne and report its position and yaw. Drones that fail during the flight, for example because
+    their position is unknown for half a second, are handled by the swarm's ``on_error`` policy. The others keep clear
+    of a failed drone's last known position, and of all drones in the swarm that are not part of this flight.
 
     Attributes:
         drones: The swarm.
@@ -61,8 +61,8 @@ class Formation:
         Args:
             drones: The swarm to fly.
             rate_hz: Rate of the set-points.
-            apart_m: Minimum distance between two drones: flights that would bring drones closer are refused, and drones
-                that come closer are steered apart.
+            apart_m: Minimum distance between two drones. Flights that would bring drones closer together are refused,
+                and drones that come closer are steered apart.
             settings: Gains, limits and acceptance radii; None for the defaults.
 
         Raises:
@@ -71,7 +71,7 @@ class Formation:
         """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
-        assignment("a formation", "control")  # load SciPy now, so that a failure does not happen in flight
+        assignment("a formation", "control")  # load SciPy now, so that it can't fail in flight
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz
@@ -90,21 +90,21 @@ class Formation:
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:
-        """Assign drones to slots and fly there in straight lines, leaving and arriving together. Then hover.
+        """Assign drones to slots, fly there in straight lines, leaving and arriving together, and then hover.
 
         Args:
-            slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
-            speed_m_s: Maximum speed of the drone with the longest path.
+            slots: Positions in world axes, (n, 3) [m]; at least one for each drone.
+            speed_m_s: Maximum speed of the drone that has the longest path.
             yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Time after which drones not at their slot have failed; None allows ten seconds more than planned.
+            timeout_s: Time until drones not at their slots have failed; None allows ten seconds more than planned.
 
         Returns:
-            The drones' final positions, and how close they came to one another.
+            A report with the drones' final positions and how close they came to each other.
 
         Raises:
-            UsageError: A drone can't be flown by its position, two would come closer than ``apart_m``, or no drone is
+            UsageError: A drone can't be flown by position, two would come closer than ``apart_m``, or no drone is
                 active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not ``"continue"``.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
             raise UsageError(f"speed_m_s is {speed_m_s!r} and must be above 0 m/s")
@@ -136,8 +136,8 @@ class Formation:
             seconds: Duration.
 
         Raises:
-            UsageError: A drone can't be flown by its position, or none is active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
+            UsageError: A drone can't be flown by position, or none is active.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not ``"continue"``.
         """
         here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
@@ -155,20 +155,20 @@ class Formation:
         lead: Callable[[Tick], AnyAction] | None = None,
         turn: bool = True,
     ) -> FormationReport:
-        """Keep followers at offsets from a leader, feeding its velocity forward, then hover.
+        """Keep followers at offsets from a leader, with its velocity fed forward, and then hover.
 
         Args:
             leader: The leader's name.
-            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader or, with
-                ``turn=False``, east, north and up of it.
+            offsets: Offsets of the followers by name, (3,) [m] each: forward, left and up in the leader's axes or, with
+                ``turn=False``, east, north and up.
             seconds: Duration.
-            lead: Returns the leader's action at each tick, sent with the followers' set-points; None if another client
-                flies the leader.
-            turn: Whether offsets and yaw turn with the leader.
+            lead: A function that returns the leader's action at each tick, which is sent with the followers'
+                set-points; None if another client flies the leader.
+            turn: Whether offsets and yaw follow the leader's yaw.
 
         Raises:
             UnknownNameError: The swarm has no drone with that name.
-            UsageError: The leader is among the followers, a drone can't be flown by its position, or none is active.
+            UsageError: The leader is among the followers, a drone can't be flown by position, or none is active.
             SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
                 followers hover and this call returns.
         """
@@ -194,9 +194,9 @@ class Formation:
     # Internals -------------------------------------------------------------------------------------------------
 
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
-        """Return the newest state of the drones flown here, and the last known state of all other airborne drones.
+        """Return the newest states of the drones steered here and the last known states of all other airborne drones.
 
-        A drone flown here whose position is no longer known has failed and is moved to the others.
+        A drone steered here fails if its position is no longer known, and then counts as one of the others.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -217,12 +217,12 @@ class Formation:
                 heard = True
             if airframe.feedback is not None and airframe.feedback.state is not FlightState.LANDED:
                 last = _carried_on(airframe)
-                if last.position_m is not None:  # keep clear of it even if its feedback has stopped
+                if last.position_m is not None:  # keep clear of the drone even if its feedback has stopped
                     others[name] = last if heard else replace_fields(last, velocity_m_s=None)
         return now, others
 
     def _ready(self) -> dict[str, Feedback]:
-        """Return the newest feedback of each drone; raise UsageError naming those that can't be flown by position."""
+        """Return each drone's newest feedback; raise UsageError naming the drones that can't be flown by position."""
         self._closest_m = math.inf
         found = self.drones.feedback(max_age_s=MAX_AGE_S)
         if not found:
@@ -235,7 +235,7 @@ class Formation:
             if not lacking(sample) and not sample.state.airborne
         ]
         if problems:
-            raise UsageError(f"these can't be flown in formation: {'; '.join(problems)}")
+            raise UsageError(f"these drones can't be flown in formation: {'; '.join(problems)}")
         return found
 
     def _check_ways(self, names: list[str], starts: Places, goals: Places) -> None:
@@ -255,7 +255,7 @@ class Formation:
         *,
         also: Mapping[str, AnyAction] | None = None,
     ) -> None:
-        """Send each drone towards its goal, which moves by ``drift`` [m/s], while keeping clear of the others."""
+        """Send each drone towards its goal, which moves at ``drift`` [m/s], and keep it clear of the others."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
         positions = _positions({**now, **others})
         wanted = [_in_world(towards[name], now[name]) + drift[name] for name in now]
@@ -281,7 +281,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """Wider acceptance radii for drones that are hovering just after arrival."""
+        """The settings with larger acceptance radii, for drones that hover just after arrival."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -297,8 +297,8 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
     Args:
         leader: The leader's newest feedback.
-        offset: Offset (3,) [m]: ahead, left and up of the leader or, with ``turn=False``, east, north and up.
-        turn: Whether the offset turns with the leader's yaw.
+        offset: Offset, (3,) [m]: forward, left and up in the leader's axes or, with ``turn=False``, east, north and up.
+        turn: Whether the offset rotates with the leader's yaw.
 
     Returns:
         The position in world axes [m], shape (3,).
@@ -315,7 +315,7 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
 
 def _carried_on(airframe: Airframe) -> Feedback:
-    """Return a drone's newest feedback; extrapolate the last position, or reuse the last yaw, if missing."""
+    """Return a drone's newest feedback, with a missing position extrapolated and a missing yaw taken from the past."""
     sample = airframe.feedback
     assert sample is not None, "called only after the first feedback"
     now_ns = sample.captured_ns
@@ -328,7 +328,7 @@ def _carried_on(airframe: Airframe) -> Feedback:
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
-    """Return distance and speed on a path of length 1 flown in time 1 from rest to rest (Flash and Hogan 1985)."""
+    """Return distance and speed for a path of length 1 flown from rest to rest in time 1 (Flash and Hogan 1985)."""
     t = within(share, 0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
 
@@ -353,7 +353,7 @@ def _vector(place: NDArray[np.float64]) -> Vector:
 
 
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
-    """Return the reported velocity in world axes; zero if it or the yaw is not reported."""
+    """Return the reported velocity in world axes; zero if either velocity or yaw is missing."""
     if sample.yaw_rad is None:
         return np.zeros(3)
     return _in_world(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample)

@@ -1,14 +1,14 @@
-"""A law that flies through a gate, and the shortest way around posts and gates. Pure: no clock, no thread.
+"""A control law for flying through a gate, and a planner for the shortest way around posts and gates. Pure.
 
-The law is position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4),
-2006) and turns sightings and feedback into velocities. The gate's position and axis are kept in odometry axes, where
-only the odometry's drift moves them. The vehicle moves onto the gate's axis while facing the opening, gets closer as it
-gets better aligned, and flies through. It flies the last metre and a half by odometry, because the gate is larger than
-the image there.
+The law uses position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4),
+2006) to compute velocities from sightings and feedback. The gate's position and axis are stored in odometry axes, where
+only odometry drift affects them. Facing the opening, the vehicle moves onto the gate's axis, approaches as its
+alignment improves, and flies through. The last metre and a half is flown by odometry, because at that range the gate no
+longer fits into the image.
 
-The way around obstacles comes from a visibility graph of the ground plan (Lozano-Pérez and Wesley, "An algorithm for
-planning collision-free paths among polyhedral obstacles", Communications of the ACM 22(10), 1979) over points around
-each obstacle, searched by Dijkstra's algorithm.
+The way around obstacles is found by Dijkstra's algorithm in a two-dimensional visibility graph over points around each
+obstacle (Lozano-Pérez and Wesley, "An algorithm for planning collision-free paths among polyhedral obstacles",
+Communications of the ACM 22(10), 1979).
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from skyloop.messages.geometry import wrap_angle
 Point = tuple[float, float]
 
 _AROUND = 8  # number of graph points around each end of a wall
-_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor that keeps the lines between these points clear
-_WITHIN_M = 0.02  # margin by which the way may come closer to a wall than its start
+_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor that keeps lines between these points clear
+_WITHIN_M = 0.02  # margin by which the way may come closer to a wall than its start or goal
 
 
 class GatePhase(StrEnum):
     """The phases of :class:`GateLaw`."""
 
     SEARCHING = "searching for the gate"  #: turning on the spot at a series of heights
-    ALIGNING = "moving onto the gate's axis"  #: gate seen a moment ago
+    ALIGNING = "moving onto the gate's axis"  #: the gate was seen a moment ago
     RECOVERING = "lost the gate: holding position, turning towards it"
-    GOING = "flying to the gate"  #: flying by the map or by a sighting
-    PASSING = "flying through"  #: aligned and close; the rest is flown by odometry
+    GOING = "flying to the gate"  #: flying by the map or a sighting
+    PASSING = "flying through"  #: aligned and close, flying by odometry
     PASSED = "through"
 
 
@@ -51,14 +51,14 @@ class GatePhase(StrEnum):
 class GateSettings:
     """Gains, limits and distances of :class:`GateLaw`.
 
-    The defaults suit a small indoor vehicle and openings of about a metre.
+    The defaults suit a small indoor vehicle and openings about a metre wide.
     """
 
-    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
-    #: Fraction of the velocity error added to the set-point, which stiffens a soft velocity loop against gusts.
+    lead_s: float = 0.12  #: delay between computing a command and its effect
+    #: Fraction of the velocity error added to the set-point, to stiffen a soft velocity loop against gusts.
     velocity_gain: float = 1.0
     speed_m_s: float = 1.1  #: maximum horizontal speed
-    cruise_m_s: float = 0.8  #: speed through the gate, and maximum speed towards it
+    cruise_m_s: float = 0.8  #: speed through the gate and maximum speed towards it
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.4
     acceleration_m_s2: float = 2.0
@@ -66,10 +66,10 @@ class GateSettings:
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
     stand_m: float = 1.7  #: distance in front of the gate at which the vehicle must be aligned
-    aligned_m: float = 0.15  #: maximum offset from the axis, sideways and in height
+    aligned_m: float = 0.15  #: maximum lateral and vertical offset from the axis
     aligned_rad: float = 0.25  #: maximum heading error
-    cone: float = 0.3  #: additional offset allowed per metre in front of `stand_m`
-    beyond_m: float = 0.7  #: distance behind the gate at which it counts as passed
+    cone: float = 0.3  #: additional offset allowed per metre of distance beyond `stand_m`
+    beyond_m: float = 0.7  #: distance behind the gate at which the gate counts as passed
     fresh_s: float = 0.4  #: time to continue without a sighting
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
@@ -90,18 +90,18 @@ class GateLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: GateSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = GatePhase.SEARCHING  #: phase at the last step
-        self.axis: Axis | None = None  #: the vehicle's position at the last step; None while the gate's is unknown
+        self.axis: Axis | None = None  #: the vehicle's position at the last step; None while the gate is not located
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._gate = _new_filter()
-        self._way: Array | None = None  # direction through the gate, horizontal unit vector
+        self._way: Array | None = None  # horizontal direction through the gate
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
-        """Forget the gate and search for the next one, turning first counter-clockwise if ``turning`` is positive."""
+        """Forget the gate and search for the next one, first turning counter-clockwise if ``turning`` is positive."""
         self.phase = GatePhase.SEARCHING
         self.forget()
         self._search.restart(turning=turning)
@@ -115,9 +115,9 @@ class GateLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
 
-        It is ignored if the vehicle's attitude or motion is unknown, or if it is far from the gate's earlier sightings.
-        The opening's centre, (3,) [m], and the visible side's normal are in body axes at the capture time, whose
-        attitude is that of ``at_capture``. ``trust`` is the confidence in the normal, 0 to 1.
+        The sighting is ignored if the vehicle's attitude or motion is unknown, or if it is far from earlier ones. It
+        consists of the opening's centre, (3,) [m], and the normal of the visible side, in body axes at the time of
+        capture; ``at_capture`` contains the attitude at that time. ``trust`` is the confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
@@ -170,7 +170,7 @@ class GateLaw(VelocityLaw):
         if self.phase is GatePhase.PASSED or axis.along_m > s.beyond_m:
             return GatePhase.PASSED
         if self.phase is GatePhase.PASSING:
-            # Odometry is only accurate for the few seconds that this takes.
+            # Odometry is accurate only for the few seconds that the passage takes.
             late = unseen_s > 2.0 * (s.stand_m + s.beyond_m) / s.cruise_m_s
             return GatePhase.RECOVERING if late else GatePhase.PASSING
         if unseen_s > s.recovering_s:
@@ -182,7 +182,7 @@ class GateLaw(VelocityLaw):
         return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
 
     def _approach(self, axis: Axis) -> float:
-        """Return the speed along the axis while aligning [m/s], which is towards the gate only within the cone."""
+        """Return the speed along the axis while aligning [m/s]: zero outside the cone, negative if too close."""
         s = self.settings
         left_m = -s.stand_m - axis.along_m
         if left_m < 0.0:
@@ -193,12 +193,12 @@ class GateLaw(VelocityLaw):
 
 
 def _new_filter() -> ConstantVelocityFilter:
-    """Create a filter for a point that is fixed in axes drifting by some centimetres per second."""
+    """Create a filter for a fixed point, given in axes that drift by a few centimetres per second."""
     return ConstantVelocityFilter(3, intensity_m2_s3=0.002, speed_m_s=0.03, gate=6.0)
 
 
 class Wall(NamedTuple):
-    """An obstacle: all points within ``reach_m`` of a line segment, or of a point if both ends are equal."""
+    """An obstacle: all points within ``reach_m`` of a line segment, or of a point if its ends are equal."""
 
     begin: Point
     end: Point
@@ -206,10 +206,10 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, excluding the start but including the goal; None if there is no way.
+    """Return the points of the shortest way, including the goal but not the start; None if there is no way.
 
-    The start or goal may be too close to a wall, but the way comes no closer to that wall. Points are east, north [m].
-    At most a few dozen walls, because the effort grows with the cube of their number.
+    Start and goal may be too close to a wall, but the way comes no closer to it. Points are east, north [m]. Pass at
+    most a few dozen walls, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)
@@ -237,7 +237,7 @@ def _corners(ends: Array, reach: Array) -> list[Array]:
 
 
 def _shortest(points: Array, lengths: Array) -> list[Point] | None:
-    """Return the shortest way from the first point to the second."""
+    """Return the shortest way from the first point to the second one."""
     best, came = {0: 0.0}, {0: 0}
     queue = [(0.0, 0)]
     while queue:
@@ -258,7 +258,7 @@ def _shortest(points: Array, lengths: Array) -> list[Point] | None:
 
 
 def _distances(begin: Array, end: Array, walls: Array) -> Array:
-    """Return the distance between each segment, (n, 2) to (n, 2), and each wall, (m, 2, 2), as shape (n, m)."""
+    """Return the distances (n, m) between n segments, given by ends (n, 2), and m walls (m, 2, 2)."""
     a, b = begin[:, None], end[:, None]
     c, d = walls[None, :, 0], walls[None, :, 1]
     apart = np.minimum(

@@ -33,7 +33,7 @@ class GateKind:
     turning: float = 1.0  #: direction to turn first if the gate is out of view: positive for left, negative for right
 
 
-#: The course of the world ``gates``.
+#: The gates in the simulated world ``gates``.
 FIVE_GATES = (
     GateKind("gate 1", (235, 110, 20)),
     GateKind("gate 2", (31, 143, 224)),
@@ -45,14 +45,14 @@ FIVE_GATES = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention."""
+    """A course with a map of its gates and poles, in the axes and yaw convention of the vehicle [m, rad]."""
 
     gates: tuple[GateKind, ...]  #: gates in order
     places: tuple[GatePlace, ...]  #: positions of the gates
     poles: tuple[Pole, ...] = ()  #: other obstacles
-    #: red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour
+    #: red, green and blue, 0 to 255; None if the camera can't recognise poles by colour
     pole_colour: tuple[int, int, int] | None = None
-    start: tuple[float, float] = (0.0, 0.0)  #: take-off position, x and y
+    start: tuple[float, float] = (0.0, 0.0)  #: take-off position: x and y [m]
     map_m: float = 0.05  #: standard deviation of the positions [m]
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class Course:
             raise UsageError(f"each gate needs one place: got {len(self.gates)} gates and {len(self.places)} places")
 
 
-#: The gates of the worlds ``race0`` to ``race3``.
+#: The gates in the simulated worlds ``race0`` to ``race3``.
 RACE_GATES = (
     GateKind("gate 1", (31, 143, 224)),
     GateKind("gate 2", (224, 194, 31)),
@@ -68,7 +68,7 @@ RACE_GATES = (
     GateKind("gate 4", (194, 63, 180)),
 )
 RACE_POLES = (208, 31, 31)  #: colour of the poles in these worlds
-#: The track of the worlds ``race0`` and ``race1``. In ``race2`` everything is displaced by up to 0.45 m.
+#: The track in the worlds ``race0`` and ``race1``; in ``race2``, everything is displaced by up to 0.45 m.
 RACE_TRACK = Course(
     RACE_GATES,
     (
@@ -84,14 +84,14 @@ RACE_TRACK = Course(
 
 
 def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -> Course:
-    """Build a course from a simulated world's map, from its gates by name, its first start and its poles.
+    """Build a course from a simulated world's map, using the named gates, the first start position and all poles.
 
     Args:
         geometry: The world's map, from a simulated drone's parameter ``world.geometry``.
-        gates: The gates of the course, in order, with the names they have in the world.
+        gates: The gates of the course, in order, named as in the world.
 
     Raises:
-        UsageError: The world lacks one of the gates, or has no start.
+        UsageError: The world lacks one of the gates or has no start position.
     """
     openings = {opening.name: opening for opening in geometry.gates}
     if missing := [gate.name for gate in gates if gate.name not in openings]:
@@ -111,12 +111,12 @@ def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -
 class FlyThroughGates(Behaviour):
     """Flies through a series of gates of known colours and hovers behind the last one.
 
-    With a :class:`Course`, it flies by the map, corrected by the camera's sightings: to the front of each gate, around
-    poles and other gates, and through in the gate's direction. If a gate stays out of sight, the vehicle hovers and the
-    behaviour ends with a warning.
+    Given a :class:`Course`, it follows the map and corrects it with camera sightings. It flies around poles and other
+    gates to the front of each gate, then through it in the gate's direction. If a gate stays out of sight, the vehicle
+    hovers and the behaviour ends with a warning.
 
-    Gates are found by colour. After losing a gate, the vehicle holds its position, turns to where it expects the gate,
-    then searches for it again. The vehicle must be airborne when :meth:`run` is called.
+    Gates are detected by colour. After losing sight of a gate, the vehicle holds its position, turns to where it
+    expects the gate, and then searches for it. The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         passed: Number of gates flown through.
@@ -142,7 +142,7 @@ class FlyThroughGates(Behaviour):
             settings: :class:`CourseSettings` with a map, otherwise :class:`GateSettings`; None for the defaults.
 
         Raises:
-            UsageError: There are no gates, a colour has no hue, or the settings are for the other law.
+            UsageError: There are no gates, a colour has no hue, or the settings are for the other control law.
             UnknownNameError: The vehicle has no such camera.
             MissingExtraError: OpenCV is not installed.
         """

@@ -1,14 +1,14 @@
-"""Behaviours that hold a position by images alone: in front of a marker, or over the ground without other positioning.
+"""Behaviours that hold a position using only images, either in front of a marker or over the ground.
 
-The marker is approached by image-based visual servoing. The method is that of Chaumette and Hutchinson, "Visual servo
-control, part I: basic approaches", IEEE Robotics & Automation Magazine 13(4), 2006, whose equation numbers are given
-below. Camera axes are optical: x right, y down, z forward. Points are the intersections of their rays with the plane at
-z = 1, shape (n, 2). A multirotor must tilt to fly, which shifts even fixed points in the image. Points are therefore
-first converted to the image of a *virtual level camera* that has the vehicle's yaw but not its roll and pitch (Jabbari,
+Markers are approached by image-based visual servoing, following Chaumette and Hutchinson, "Visual servo control, part
+I: basic approaches", IEEE Robotics & Automation Magazine 13(4), 2006; equation numbers refer to that paper. Camera axes
+are optical: x right, y down, z forward. Points are given by the intersections of their rays with the plane at z = 1,
+shape (n, 2). A multirotor must tilt to fly, which shifts even fixed points in the image. Points are therefore first
+converted to the image of a *virtual level camera* with the vehicle's yaw but without its roll and pitch (Jabbari,
 Oriolo and Bolandi, "An adaptive scheme for image-based visual servoing of an underactuated UAV", Int. J. Robotics and
 Automation 29(1), 2014), and the twist is restricted to motions of the levelled vehicle: forward, left, up and yaw.
 
-Over the ground, optical flow measures the drift, and attitude set-points counteract it.
+Over the ground, the drift is measured by optical flow and counteracted by attitude set-points.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ if TYPE_CHECKING:
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:
-    """Return the interaction matrix (2n, 6) of points (n, 2), their image motion per camera twist (equation 11).
+    """Return the interaction matrix (2n, 6) of points (n, 2): their image motion per camera twist (equation 11).
 
     The twist is the camera's velocity [m/s] and angular velocity [rad/s] along and about its own axes, (6,). The rows
-    are x and y of each point in turn.
+    alternate between x and y, point by point.
     """
     points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
         raise UsageError(f"points need shape (n, 2) and depths (n,), got {points.shape} and {depths.shape}")
     if not (np.isfinite(points).all() and np.isfinite(depths).all() and (depths > 0.0).all()):
-        raise UsageError("points must be finite, and depths above 0")
+        raise UsageError("points must be finite and depths above 0")
     x, y, z, none = points[:, 0], points[:, 1], 1.0 / depths, np.zeros(len(points))
     along_x = np.column_stack([-z, none, x * z, x * y, -(1.0 + x * x), y])
     along_y = np.column_stack([none, -z, y * z, 1.0 + y * y, -x * y, -x])
@@ -59,10 +59,10 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 
 
 def camera_twist(camera: CameraInfo) -> Array:
-    """Return the matrix (6, 4) that converts the levelled vehicle's motion to the twist of a level camera.
+    """Return the matrix (6, 4) that converts motion of the levelled vehicle to the twist of a level camera.
 
-    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's position in the body matters, because a
-    camera mounted ahead of the centre swings when the vehicle turns.
+    The columns stand for forward, left, up [m/s] and yaw rate [rad/s]. The camera's mounting position matters, because
+    a camera ahead of the centre swings sideways when the vehicle turns.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -75,7 +75,7 @@ def camera_twist(camera: CameraInfo) -> Array:
 
 
 def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
-    """Return points (n, 2) as a level camera would see them; UsageError if one would not be in front of it."""
+    """Return points (n, 2) as a level camera would see them; raise UsageError if one would not be in front of it."""
     mounting = mounting_rotation(camera)
     turn = mounting.T @ rotation_from_euler(roll, pitch, 0.0) @ mounting
     rays = np.column_stack([points, np.ones(len(points))]) @ turn.T
@@ -85,7 +85,7 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that brings the level camera's points (n, 2) to their wanted positions at an exponential rate.
+    """Compute the motion that makes a level camera's points (n, 2) converge exponentially to their wanted positions.
 
     The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`): forward, left, up [m/s] and yaw
     rate [rad/s], (4,). The gain is in 1/s.
@@ -116,13 +116,13 @@ class ServoSettings:
     """Gain and limits of :class:`ImageServoLaw`."""
 
     gain: float = 0.8  #: [1/s]
-    #: Fraction of the velocity error (if the velocity is known) that is added to the set-point against gusts.
+    #: Fraction of the velocity error that is added to the set-point against gusts if the velocity is known.
     velocity_gain: float = 1.0
     speed_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.0
     acceleration_m_s2: float = 2.0
-    fresh_s: float = 0.3  #: time to continue without a sighting
+    fresh_s: float = 0.3  #: time to carry on without a sighting
     holding_s: float = 2.0
     search_rad_s: float = 0.7
 
@@ -131,20 +131,20 @@ class ServoSettings:
 
 
 class ImageServoLaw(VelocityLaw):
-    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns]."""
+    """Computes velocities from points in the image. Pure; times are on the proxy's clock [ns]."""
 
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
     ) -> None:
-        """Initialise the law with the points wanted in the level camera, (n, 2) at z = 1, and their depth there."""
-        mounting_rotation(camera)  # raises here rather than in flight
+        """Initialise the law with the points that a level camera should see, (n, 2) at z = 1, and their depth [m]."""
+        mounting_rotation(camera)  # raises any error here rather than in flight
         s = self.settings = settings or ServoSettings()
         limits = SetpointLimits(
             s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0
         )
         super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING  #: phase at the last step
-        self.error = math.inf  #: RMS distance between the points and their wanted positions, plane at z = 1
+        self.error = math.inf  #: RMS distance between the points and their wanted positions in the plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
         self._depth_m = depth_m
@@ -153,10 +153,10 @@ class ImageServoLaw(VelocityLaw):
         self._search = TurningSearch(s.search_rad_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the points (n, 2) from a frame as the camera saw them, in the plane at z = 1.
+        """Update with the points (n, 2) that the camera saw in a frame, in the plane at z = 1.
 
-        They are ignored, as if nothing were seen, if the attitude is unknown or the vehicle is tilted so far that a
-        level camera would not see them. The depth of all points is estimated from their apparent size.
+        The points are ignored if the attitude is unknown or if the vehicle is tilted so far that a level camera would
+        not see them. Their common depth is estimated from their apparent size.
         """
         self.airframe.add(at_capture)
         roll, pitch = at_capture.roll_rad, at_capture.pitch_rad
@@ -167,7 +167,7 @@ class ImageServoLaw(VelocityLaw):
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
-        # Averaging depths now and at the goal keeps large motions straight (Chaumette and Hutchinson, equation 14).
+        # Averaging the current depth and the depth at the goal keeps large motions straight (equation 14).
         now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))
         depths = np.full(len(level), (now_m + self._depth_m) / 2)
         self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
@@ -193,9 +193,9 @@ class ImageServoLaw(VelocityLaw):
 
 
 class ImageServo(Behaviour):
-    """Flies to where a marker looks as it does from ``distance_m`` straight in front of it, and holds that position.
+    """Flies to where a marker appears as seen from ``distance_m`` straight in front of it, and holds that position.
 
-    Works purely in the image; the marker's size is only used to compute the wanted image. Runs until stopped.
+    Control works purely in the image: the marker's size is only used to compute the wanted image. Runs until stopped.
     """
 
     name = "servo"
@@ -216,22 +216,22 @@ class ImageServo(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Id of the marker.
+            marker_id: ID of the marker.
             distance_m: Wanted distance straight in front of the marker.
-            size_m: Edge of the marker's black square.
+            size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: A camera that looks forward; None for the vehicle's first camera.
-            settings: Settings of the law; None for the defaults.
+            camera: A forward-facing camera; None for the vehicle's first camera.
+            settings: Settings for the control law; None for the defaults.
 
         Raises:
-            UsageError: The distance is not a finite number greater than 0, or the camera does not look forward.
+            UsageError: The distance is not a finite number greater than 0, or the camera does not face forward.
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
         require_positive(distance_m=distance_m)
         info = camera_info(drone, camera)
         if mounting_rotation(info)[0, 2] < 0.5:
-            raise UsageError(f"camera {info.name!r} does not look forward")
+            raise UsageError(f"camera {info.name!r} does not face forward")
         self.marker_id = marker_id
         self._wanted = rectangle(size_m, size_m)[:, :2] * (1.0, -1.0) / distance_m
         self._servo_law = ImageServoLaw(info, self._wanted, distance_m, settings)
@@ -250,7 +250,7 @@ class ImageServo(Behaviour):
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the marker's corners and update the law."""
+        """Detect the marker's corners and update the control law."""
         intrinsics = frame.intrinsics
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None or intrinsics is None:
@@ -268,7 +268,7 @@ class ImageServo(Behaviour):
 
 
 def _size(points: Array) -> float:
-    """Return the points' apparent size: the root mean square distance from their middle."""
+    """Return the apparent size of the points: the root mean square distance from their mean."""
     return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
@@ -284,14 +284,14 @@ class FlowPhase(StrEnum):
 class FlowSettings:
     """Gains and limits of :class:`FlowLaw`."""
 
-    gain: float = 2.5  #: acceleration per distance [1/s²]
-    damping: float = 2.6  #: acceleration per velocity [1/s]
-    integral: float = 0.6  #: acceleration per distance and time, against wind [1/s³]
+    gain: float = 2.5  #: acceleration per metre of distance [1/s²]
+    damping: float = 2.6  #: acceleration per unit of velocity [1/s]
+    integral: float = 0.6  #: acceleration per metre of distance per second, against wind [1/s³]
     tilt_rad: float = 0.2
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.12  #: time from deciding on a set-point until it takes effect
-    fresh_s: float = 0.3  #: time to continue without sight of the ground
+    lead_s: float = 0.12  #: delay between computing a set-point and its effect
+    fresh_s: float = 0.3  #: time to carry on without sight of the ground
 
     def __post_init__(self) -> None:
         require_positive(self.__dataclass_fields__, **asdict(self))
@@ -299,7 +299,7 @@ class FlowSettings:
 
 @dataclass(slots=True)
 class _Kept:
-    """The state to hold: yaw [rad], altitude [m], and position (2,) [m] in the tracker's axes."""
+    """The state to hold: yaw [rad], altitude [m], and position (2,) [m] in the ground tracker's axes."""
 
     yaw: float
     altitude: float
@@ -307,14 +307,14 @@ class _Kept:
 
 
 class FlowLaw(AirframeLaw):
-    """Computes attitudes from horizontal positions. Pure: times are on the proxy's clock [ns].
+    """Computes attitudes from horizontal positions. Pure; times are on the proxy's clock [ns].
 
-    There is one PID controller per axis: acceleration from the position, its integral and the velocity. The velocity
-    comes from a constant-velocity filter over the positions, not from the vehicle.
+    A PID controller for each axis computes the acceleration from the position, its integral and the velocity. The
+    velocity comes from a constant-velocity filter over the positions, not from the vehicle.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING  #: phase at the last step
@@ -330,9 +330,9 @@ class FlowLaw(AirframeLaw):
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position at a capture time, (2,) [m], along yaw 0 and to its left.
+        """Update with a position at a capture time, (2,) [m], along yaw 0 and to the left of it.
 
-        The first one, or the first after a second without any, becomes the position to hold.
+        The first position becomes the position to hold, as does the first one after a gap of more than a second.
         """
         newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():
@@ -345,7 +345,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the set-point for now. While the position is unknown it is level, which doesn't brake."""
+        """Compute the current set-point. While the position is unknown, the attitude is level, which doesn't brake."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -373,11 +373,11 @@ class FlowLaw(AirframeLaw):
 
 
 class FlowHover(Behaviour):
-    """Holds the position, height and yaw at which it first saw the ground, using a camera that looks down.
+    """Holds the position, height and yaw at which it first saw the ground, using a downward-facing camera.
 
-    Needs the vehicle's attitude and height, uses nothing else from its feedback, and flies by attitude. Without sight
-    of the ground, the vehicle only hovers and may drift, and a warning event is published. The behaviour
-    then holds the position at which it sees the ground again.
+    It requires only attitude and height from the vehicle's feedback and flies by attitude set-points. Without sight of
+    the ground, the vehicle hovers and may drift, and a warning event is published. Once the ground is in view again,
+    the behaviour holds its new position.
     """
 
     name = "flow hover"
@@ -388,8 +388,8 @@ class FlowHover(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            camera: A camera that looks down.
-            settings: Settings of the law; None for the defaults.
+            camera: A downward-facing camera.
+            settings: Settings for the control law; None for the defaults.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -397,7 +397,7 @@ class FlowHover(Behaviour):
             MissingExtraError: OpenCV is not installed.
         """
         if "attitude" not in drone.capabilities.actions:
-            raise UsageError("this vehicle does not fly by attitude")
+            raise UsageError("this vehicle does not accept attitude set-points")
         self._flow_law = FlowLaw(settings)
         super().__init__(drone, self._flow_law, camera)
         self._tracker = GroundTracker(self._mounting)
@@ -413,7 +413,7 @@ class FlowHover(Behaviour):
         return self._flow_law.off_m
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point, but hover instead while the ground is out of view (the phase's event reports it)."""
+        """Send the set-point, or hover while the ground is out of view, which the event for the phase reports."""
         if self.phase is FlowPhase.HOLDING:
             super().steer(wanted)
         else:

@@ -1,11 +1,11 @@
-"""Kalman filters for points seen intermittently. Pure. Times are nanoseconds on one clock.
+"""Kalman filters for points seen intermittently. Pure. All times are in nanoseconds on the same clock.
 
 :class:`ConstantVelocityFilter` assumes straight motion in any number of dimensions. :class:`TurningTargetFilter` also
-models turning and speeding up, as by a platform on wheels: its horizontal state is (x, y, vx, vy, ω, ax, ay), a
+models turns and acceleration, for example of a platform on wheels. Its horizontal state is (x, y, vx, vy, ω, ax, ay): a
 coordinated turn with an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking
 and Navigation", Wiley 2001, section 11.7) plus an acceleration that fades (Singer, "Estimating Optimal Tracking Filter
-Performance for Manned Maneuvering Targets", IEEE T-AES 6(4), 1970). The turn explains fast motion on a curve and is
-predicted to continue; the acceleration explains slow motion. A separate filter tracks the height.
+Performance for Manned Maneuvering Targets", IEEE T-AES 6(4), 1970). The turn accounts for fast motion on a curve and is
+predicted to continue; the acceleration accounts for slow motion. The height has a separate filter.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from skyloop.control.limiting import Array, require_positive, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
-#: Added to an innovation's variance so that a nearly exact state does not cause a division by zero.
+#: Terms added to an innovation's variance so that a nearly exact state does not cause a division by zero.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
-_SEEN = np.eye(2, 7)  # the measured part of the state
-_STEP_S = 0.1  # maximum time step of a prediction; the acceleration keeps its direction within a step
-_STRAIGHT_RAD = 1e-4  # angle below which the transition uses its series expansion
+_SEEN = np.eye(2, 7)  # selection of the measured part of the state
+_STEP_S = 0.1  # maximum time step of a prediction; within a step, the acceleration's direction is constant
+_STRAIGHT_RAD = 1e-4  # angle below which the transition is computed by series expansion
 _HEIGHT_INTENSITY_M2_S3 = 0.01  # intensity of the random vertical acceleration
 _CLIMB_M_S = 0.3  # initial standard deviation of the vertical velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """A point's position and velocity at a time, with their covariance."""
+    """The position and velocity of a target at a point in time, with their covariance."""
 
     at_ns: int
     position: Array  #: position, (n,) [m]
@@ -50,13 +50,13 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnEstimate:
-    """A point's motion at a time."""
+    """The motion of a turning target at a point in time."""
 
     at_ns: int
     position: Array  #: position, (3,) [m]
     velocity: Array  #: velocity, (3,) [m/s]
-    turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise from above [rad/s]
-    extra: Array  #: horizontal acceleration in addition to the turn's, (2,) [m/s²]
+    turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise as seen from above [rad/s]
+    extra: Array  #: horizontal acceleration in addition to that of the turn, (2,) [m/s²]
     covariance: Array  #: covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7)
 
     @property
@@ -66,7 +66,7 @@ class TurnEstimate:
 
     @property
     def turning_rad_s(self) -> float:
-        """Unsigned turn rate of the horizontal velocity from both accelerations; 0 for a point at rest."""
+        """Unsigned turn rate of the horizontal velocity due to both accelerations; 0 for a point at rest."""
         (vx, vy), (ax, ay) = self.velocity[:2].tolist(), self.acceleration.tolist()
         squared = vx * vx + vy * vy
         return abs(vx * ay - vy * ax) / squared if squared > 0.0 else 0.0
@@ -94,15 +94,15 @@ class _Filter(ABC, Generic[_E]):
             raise UsageError(f"gate is {gate!r} and must be above 0")
         self._n, self._gate = dimensions, gate
         self._estimate: _E | None = None
-        self.refused = 0  #: number of measurements outside the gate since the last one inside it
+        self.refused = 0  #: number of measurements refused by the gate since the last accepted one
 
     @property
     def newest(self) -> _E | None:
-        """Estimate from the last measurement; None before the first one."""
+        """Estimate after the last measurement; None before the first one."""
         return self._estimate
 
     def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> _E:
-        """Restart at a measured position with velocity 0.
+        """Restart at a measured position with zero velocity.
 
         Args:
             position: As in :meth:`update`.
@@ -110,7 +110,7 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Raises:
-            UsageError: A shape is wrong, or a number is not finite.
+            UsageError: An array has the wrong shape, or a number is not finite.
         """
         self._estimate = self._started(*self._checked(position, deviation_m), at_ns)
         self.refused = 0
@@ -125,10 +125,10 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether it was used: False outside the gate (counted in :attr:`refused`) or if older than the last.
+            Whether the position was used. False means outside the gate (counted in :attr:`refused`) or too old.
 
         Raises:
-            UsageError: A shape is wrong, a number is not finite, or both the estimate and the measurement are exact.
+            UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
         """
         if self._estimate is None:
             self.start(position, deviation_m, at_ns)
@@ -143,11 +143,11 @@ class _Filter(ABC, Generic[_E]):
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict the estimate for a time. For times before the last measurement, return that measurement's estimate.
+        """Predict the estimate for a time; for times before the last measurement, return the last estimate.
 
         Args:
-            at_ns: The time to predict for.
-            longest_s: Maximum time to extrapolate the last measurement.
+            at_ns: Time of the prediction.
+            longest_s: Maximum time over which to extrapolate from the last measurement.
 
         Raises:
             UsageError: There has been no measurement.
@@ -157,7 +157,7 @@ class _Filter(ABC, Generic[_E]):
         return self.predicted(self._estimate, at_ns, longest_s=longest_s)
 
     def predicted(self, last: _E, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict from any estimate of this filter, as in :meth:`at`."""
+        """Predict from any earlier estimate of this filter, as in :meth:`at`."""
         return self._moved(last, within(seconds(at_ns - last.at_ns), 0.0, longest_s))
 
     @abstractmethod
@@ -198,13 +198,13 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
         Args:
             dimensions: Number of dimensions of the position; 1 or more.
-            intensity_m2_s3: White noise of the acceleration; its root is how far the velocity wanders within a second.
+            intensity_m2_s3: Intensity of the acceleration's white noise; its root is the velocity change in 1 s.
             speed_m_s: Initial standard deviation of each velocity component.
-            gate: Refuse measurements that are more than this many standard deviations off (Mahalanobis distance);
-                ``math.inf`` refuses none.
+            gate: Mahalanobis distance, in standard deviations, above which measurements are refused; ``math.inf``
+                accepts all.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         if isinstance(dimensions, bool) or not isinstance(dimensions, int) or dimensions < 1:
             raise UsageError(f"dimensions is {dimensions!r} and must be a whole number of at least 1")
@@ -239,7 +239,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from positions (3,), each with one deviation greater than 0."""
+    """Estimates a point's motion in levelled axes from positions (3,) with standard deviations greater than 0."""
 
     def __init__(
         self,
@@ -255,16 +255,16 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
         """Initialise the filter.
 
         Args:
-            intensity_m2_s3: Intensity of the acceleration's white noise, besides the turn and the extra acceleration.
+            intensity_m2_s3: Intensity of the white noise in addition to turn and extra acceleration.
             speed_m_s: Initial standard deviation of each velocity component.
             turn_rad_s: Initial standard deviation of the turn rate.
-            turn_wander_rad_s: Change of the turn rate within a second.
+            turn_wander_rad_s: Typical change of the turn rate in one second.
             extra_m_s2: Standard deviation of each component of the extra acceleration.
-            extra_s: Time in which the extra acceleration fades to a third; greater than 0.
-            gate: Refuse positions that are more than this many standard deviations off (Mahalanobis distance).
+            extra_s: Time constant with which the extra acceleration fades; greater than 0.
+            gate: Mahalanobis distance, in standard deviations, above which positions are refused.
 
         Raises:
-            UsageError: An argument is out of its range.
+            UsageError: An argument is out of range.
         """
         super().__init__(
             3,

@@ -1,12 +1,12 @@
-"""A law that lands on a marker that may move, from sightings and feedback. Pure: no clock, no thread.
+"""A control law for landing on a still or moving marker, based on sightings and feedback. Pure.
 
-A filter for straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. The vehicle flies to
-where the marker will be when the set-point takes effect, matching its velocity and acceleration, by the vehicle's
-predicted motion (:mod:`.response`). It descends while inside a cone above the marker, as in Saripalli, Montgomery and
-Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the cone it keeps its
-height, or climbs to see more, and closes in first. The last part, where the marker no longer fits into the image, is
-flown by prediction. If the vehicle would touch down too far off, it aborts with a climb along the marker's predicted
-path. After a number of aborted attempts it gives up and hovers at a safe height.
+A filter for straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. Using a prediction of
+its own motion (:mod:`.response`), the vehicle flies to where the marker will be when the set-point takes effect and
+matches its velocity and acceleration. It descends while it is inside a cone above the marker, as in Saripalli,
+Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the
+cone it first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the image, the
+vehicle flies by prediction. If it would touch down too far off, it aborts and climbs along the marker's predicted path.
+After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
@@ -39,68 +39,68 @@ from skyloop.messages.geometry import rotation_from_euler
 
 _MAY_BE_0 = frozenset({"wait_s", "climb_gain", "sight_s"})
 _MAY_BE_INFINITE = frozenset({"give_up_s", "ceiling_m"})
-_BELOW_CEILING_M = 0.2  # margin of the search height below the maximum altitude, near which the proxy slows climbs
+_BELOW_CEILING_M = 0.2  # margin of the search height to the maximum altitude, because the proxy slows climbs near it
 
 
 @dataclass(frozen=True, slots=True)
 class LandingSettings:
     """Gains, limits and heights of :class:`~skyloop.control.landing_law.LandingLaw`.
 
-    Heights are those of the feet above the marker unless stated otherwise.
+    Unless stated otherwise, heights are measured from the marker to the vehicle's feet.
     """
 
     response: ResponseSettings = field(default_factory=ResponseSettings)  #: response to velocity set-points
-    position_gain: float = 12.0  #: acceleration per offset [1/s²]
-    velocity_gain: float = 6.0  #: acceleration per velocity error [1/s]
-    climb_gain: float = 1.0  #: fraction of the climb rate's error added to the set-point
+    position_gain: float = 12.0  #: acceleration per metre of offset [1/s²]
+    velocity_gain: float = 6.0  #: acceleration per unit of velocity error [1/s]
+    climb_gain: float = 1.0  #: fraction of the climb rate error added to the set-point
     speed_m_s: float = 8.0  #: maximum horizontal speed
     climb_m_s: float = 0.7  #: maximum vertical speed
-    acceleration_m_s2: float = 15.0  #: limit of the set-point's horizontal change, for vehicles that respond faster
-    climb_acceleration_m_s2: float = 2.0  #: limit of the set-point's vertical change
-    closing_m_s: float = 1.5  #: maximum speed relative to the marker on the way to it
-    braking_m_s2: float = 1.0  #: deceleration to the marker's velocity when arriving
-    known_m_s: float = 0.5  #: standard deviation of the marker's velocity below which to follow the marker
-    sight_m: float = 0.004  #: standard deviation of a sighting's position close to the camera
-    sight_share: float = 0.004  #: growth of that deviation per metre of distance
-    sight_s: float = 0.01  #: possible delay between attitude and frame, whose errors grow with the turn rate
+    acceleration_m_s2: float = 15.0  #: maximum rate of change of the horizontal set-point, for fast-responding vehicles
+    climb_acceleration_m_s2: float = 2.0  #: maximum rate of change of the vertical set-point
+    closing_m_s: float = 1.5  #: maximum speed relative to the marker while approaching it
+    braking_m_s2: float = 1.0  #: deceleration to the marker's velocity on arrival
+    known_m_s: float = 0.5  #: standard deviation of the marker's velocity below which the vehicle follows it
+    sight_m: float = 0.004  #: standard deviation of marker positions close to the camera
+    sight_share: float = 0.004  #: increase of this deviation per metre of distance
+    sight_s: float = 0.01  #: possible delay between attitude and frame; its effect grows with the turn rate
 
     descent_m_s: float = 0.45
     cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
-    cone: float = 0.2  #: growth of the cone's radius per metre of height
-    view: float = 0.3  #: offset as a fraction of the height beyond which the vehicle climbs to see the marker
-    #: Below this height the vehicle descends by the filter, with or without sight of the marker, if it is over the
-    #: marker's centre, matches its speed, and the marker's motion agrees with that predicted ``foresight_s`` earlier.
+    cone: float = 0.2  #: increase of the cone's radius per metre of height
+    view: float = 0.3  #: ratio of offset to height above which the vehicle climbs to see the marker
+    #: Height below which the vehicle relies on the filter and descends even without sight of the marker, provided that
+    #: it is over the marker's centre, matches its speed, and the marker has moved as predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
     commit_off_m: float = 0.08
     commit_m_s: float = 0.25
-    commit_turn_rad_s: float = 1.2  #: maximum turn rate of the marker: the vehicle waits while it turns faster
+    commit_turn_rad_s: float = 1.2  #: maximum turn rate of the marker for touching down
     foresight_s: float = 0.7
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
-    #: Abort a touch-down that would miss by more than this, or if the marker is out of sight for over ``blind_s``. Just
-    #: above the marker (``nearly_m``), abort only if the touch-down would miss the platform.
+    #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
+    #: ``blind_s``. Just above the marker (``nearly_m``), it is aborted only if the vehicle would miss the platform.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
-    pad_m: float = 0.3  #: distance from the marker's centre at which a touch-down is still safely on the platform
+    pad_m: float = 0.3  #: maximum distance from the marker's centre for a safe touch-down on the platform
     touch_m: float = 0.03  #: height below which the vehicle counts as touched down
     feet_m: float = 0.06  #: distance of the feet below the body's centre
 
-    #: Align the image's longer side with the motion of a marker faster than this, to see it for longer.
+    #: Marker speed above which the image's longer side is aligned with its motion, to see it for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
-    long_side_rad: float = math.pi / 2  #: angle of the image's longer side from forward, counter-clockwise from above
+    long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
 
-    fresh_s: float = 0.35  #: time to continue without a sighting
-    recovering_s: float = 4.0  #: time to follow an unseen marker's predicted position before searching
-    search_height_m: float = 2.6  #: height above the ground for searching, and the safe height to hover at
+    fresh_s: float = 0.35  #: time to carry on without a sighting
+    recovering_s: float = 4.0  #: time to follow the predicted position of an unseen marker before searching
+    search_height_m: float = 2.6  #: height above the ground for searching and for hovering safely
     search_speed_m_s: float = 1.0
-    search_lane_m: float = 1.1  #: distance between the spiral's lanes: the camera's view minus a margin
-    search_largest_m: float = 5.5  #: the spiral's longest leg
+    search_lane_m: float = 1.1  #: distance between the lanes of the spiral: the camera's view minus a margin
+    search_largest_m: float = 5.5  #: longest leg of the spiral
     ceiling_m: float = math.inf  #: maximum altitude above the ground
-    wait_s: float = 0.0  #: time to wait for the marker to pass before starting the spiral
-    attempts: int = 8  #: number of aborted touch-downs after which to give up
-    give_up_s: float = math.inf  #: time after the start at which to give up
+    wait_s: float = 0.0  #: time to wait for the marker to pass by before starting the spiral
+    attempts: int = 8  #: number of aborted touch-downs before giving up
+    give_up_s: float = math.inf  #: time from the start until giving up
 
     def __post_init__(self) -> None:
         if isinstance(self.attempts, bool) or not isinstance(self.attempts, int) or self.attempts < 1:
@@ -115,7 +115,7 @@ class LandingSettings:
     def within(self, limits: Mapping[str, Value]) -> LandingSettings:
         """Return these settings clamped to a drone's ``limits.…``, so that no set-point exceeds them.
 
-        A missing limit sets none. UsageError if they don't allow the height needed for the search.
+        Missing limits have no effect. Raises UsageError if the limits don't allow the height needed for the search.
         """
         climb = lowered(self.climb_m_s, limits, "limits.climb")
         return replace(
@@ -130,14 +130,14 @@ class LandingSettings:
         )
 
 
-_KEPT_S = 2.0  # duration of the history of estimates, kept to check how well the motion was predicted
-_MOST_REFUSED = 4  # sightings in a row outside the gate after which the filter restarts
-_CONTRADICTED = 2  # sightings in a row outside the gate after which a touch-down is aborted
-_LATEST_S = 0.1  # maximum time to extrapolate the turn rate from a frame's feedback
-_REACTION_S = 0.25  # time for which a velocity error shifts the touch-down point, until it is corrected
-_JUST = 0.999  # factor below a limit, because converting a velocity to body axes may round it up
-_MOVES_M_S = 0.1  # minimum speed of a target with a direction that can turn
-_FRESH_S = 0.2  # maximum age of the motion for a touch-down to count
+_KEPT_S = 2.0  # length of the history of estimates, used to check how well the motion was predicted
+_MOST_REFUSED = 4  # number of consecutive sightings outside the filter's gate that cause a restart
+_CONTRADICTED = 2  # number of consecutive sightings outside the filter's gate that abort a touch-down
+_LATEST_S = 0.1  # maximum time over which the turn rate in a frame's feedback is extrapolated
+_REACTION_S = 0.25  # time for which a velocity error shifts the touch-down point before it is corrected
+_JUST = 0.999  # safety factor for the speed limit, because converting a velocity to body axes may round it up
+_MOVES_M_S = 0.1  # minimum speed of a marker for its turn rate to matter
+_FRESH_S = 0.2  # maximum age of the velocity for a touch-down to count
 _GIVEN_UP_CLIMB_S = 4.0  # duration of the climb for a vehicle without an altimeter
 
 
@@ -155,13 +155,13 @@ class LandingPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """The marker relative to the vehicle at the time when a set-point sent now takes effect."""
+    """The marker's motion relative to the vehicle at the time when a set-point sent now takes effect."""
 
     target: TurnEstimate
-    offset: Array  #: offset from the vehicle's centre, (3,) [m]
+    offset: Array  #: position relative to the vehicle's centre, (3,) [m]
     velocity: Array  #: relative velocity, (2,) [m/s]
     height: float  #: height of the feet above the marker [m]
-    touching_off: float  #: distance by which a touch-down would miss now [m]
+    touching_off: float  #: distance by which a touch-down would currently miss [m]
 
 
 class LandingLaw(AirframeLaw):
@@ -171,12 +171,12 @@ class LandingLaw(AirframeLaw):
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
-        """Initialise the law."""
+        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING  #: phase at the last step
         self.height_m: float | None = None  #: height of the feet above the marker; None while searching
-        self.off_m: float | None = None  #: horizontal distance from its centre; None while searching
+        self.off_m: float | None = None  #: horizontal distance from the marker's centre; None while searching
         self.aborted = 0  #: number of aborted touch-downs
         self._response = VelocityResponse(s.response)
         self._target = TurningTargetFilter()
@@ -215,7 +215,7 @@ class LandingLaw(AirframeLaw):
             self._response.add(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart from rest with a search, because a vehicle that was down may have been flown elsewhere."""
+        """Restart from rest with a search, because a landed vehicle may have been flown elsewhere."""
         super().pause()
         self._limiter.reset(Velocity())
         self._response.pause()
@@ -224,7 +224,7 @@ class LandingLaw(AirframeLaw):
             self.phase = LandingPhase.SEARCHING
 
     def forget(self) -> None:
-        """Forget where the marker is. The phases DOWN and GIVEN_UP remain."""
+        """Forget where the marker is, but keep the phases DOWN and GIVEN_UP."""
         self._target, self._seen_ns, self._committed_ns = TurningTargetFilter(), None, None
         self._place, self._searching_ns = None, None
         self._past.clear()
@@ -234,9 +234,9 @@ class LandingLaw(AirframeLaw):
         self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the marker's centre in body axes, (3,) [m]; ignore it if attitude or motion are unknown.
+        """Update with the marker's centre in body axes, (3,) [m]; ignore it if attitude or motion is unknown.
 
-        The attitude is that of ``at_capture``, which is extrapolated by its turn rate if it is older than the frame.
+        The attitude in ``at_capture`` is used; if it is older than the frame, it is extrapolated using the turn rate.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position)
         if found is None:
@@ -259,7 +259,7 @@ class LandingLaw(AirframeLaw):
             self._past.popleft()
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now: zero while the vehicle's motion is unknown, and once it is down."""
+        """Compute the current set-point, which is zero while the vehicle's motion is unknown and after touch-down."""
         if self.phase is LandingPhase.DOWN or not self._ready(now_ns):
             return Velocity()
         newest, ahead = self.airframe.newest, self._response.predict(now_ns)
@@ -282,22 +282,22 @@ class LandingLaw(AirframeLaw):
         return Velocity(forward=forward, left=left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _turn(self, own: Motion) -> float:
-        """Return the yaw rate that aligns the image's longer side with a fast marker's motion [rad/s]."""
+        """Return the yaw rate [rad/s] that aligns the image's longer side with the motion of a fast marker."""
         s, newest = self.settings, self._target.newest
         if newest is None or float(np.hypot(*newest.velocity[:2])) < s.turn_from_m_s:
             return 0.0
         way = math.atan2(newest.velocity[1], newest.velocity[0])
-        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # either direction will do
+        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # both directions are equally good
         return clamped(1.5 * error, s.turn_rad_s)
 
     def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
-        """Return the marker relative to the vehicle; None if it was never seen or not recently."""
+        """Return the marker's motion relative to the vehicle; None if it has never been seen or not recently."""
         s = self.settings
         if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
             return None
         target = self._target.at(own.at_ns)
         if self.phase is LandingPhase.SEARCHING and target.speed_deviation_m_s > s.known_m_s:
-            return None  # if it flew by position alone, the vehicle would meet a fast marker head-on
+            return None  # by position alone, the vehicle would meet a fast marker head-on
         offset, velocity = target.position - own.position, (target.velocity - own.velocity)[:2]
         height = -float(offset[2]) - s.feet_m
         left_s = clamped(height / s.final_descent_m_s, _REACTION_S)
@@ -342,7 +342,7 @@ class LandingLaw(AirframeLaw):
         return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s or contradicted
 
     def _may_touch_down(self, relative: _Relative) -> bool:
-        """Return whether the vehicle is over the marker, matches its speed and predicted its recent motion well."""
+        """Return whether the vehicle is over the marker at matching speed and the marker has moved as predicted."""
         s = self.settings
         if self._target.refused or relative.touching_off > s.commit_off_m:
             return False
@@ -394,7 +394,7 @@ class LandingLaw(AirframeLaw):
         return clamped(max(0.0, off / s.view - height), s.climb_m_s)
 
     def _searched(self, own: Motion, now_ns: int) -> Array:
-        """Return the search velocity: wait where the marker last passed, or here, then fly the spiral."""
+        """Return the search velocity: first wait at the marker's last position, or here, then fly the spiral."""
         s = self.settings
         if self._searching_ns is None:
             self._searching_ns = now_ns
@@ -425,14 +425,14 @@ def _then(newest: Motion, ahead: Predicted) -> Motion:
 
 
 class SpiralSearch:
-    """Flies an expanding square around its start. After the largest square it returns and starts over.
+    """Flies an expanding square around its starting point; after the largest square it returns there and starts over.
 
-    This is the expanding-square search of sea rescue, with a camera that looks down: International Aeronautical and
+    This is the expanding-square search of sea rescue, with a downward-facing camera: International Aeronautical and
     Maritime Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes with quarter turns).
     """
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
-        """Initialise the search with the lanes' distance, the maximum speed and the longest leg's length."""
+        """Initialise the search with the distance between lanes, the maximum speed and the maximum length of a leg."""
         require_positive(lane_m=lane_m, speed_m_s=speed_m_s, largest_m=largest_m)
         self._lane, self._speed = lane_m, speed_m_s
         self._legs = max(1, int(largest_m / lane_m)) * 2
@@ -441,11 +441,11 @@ class SpiralSearch:
         self._begin: Array | None = None
 
     def restart(self) -> None:
-        """Start the next search around the position given to its first step."""
+        """Restart the search; it will be centred on the position passed to its first step."""
         self._leg, self._goal = 0, None
 
     def step(self, position: Array) -> Array:
-        """Return the wanted velocity (2,) [m/s] for a position (2,) [m], in the same axes."""
+        """Return the wanted velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
         if self._goal is None:
             self._begin = self._goal = position.copy()
         way = self._goal - position

@@ -1,6 +1,6 @@
-"""Limits for numbers, vectors and set-points: for their size and for how fast they change. Pure.
+"""Limits on the magnitude and rate of change of numbers, vectors and set-points. Pure.
 
-NaN never passes: it counts as 0 or as the number nearest to 0 in the range.
+NaN never passes through: it is replaced with 0 or the allowed number nearest to 0.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["GRAVITY_M_S2", "SetpointLimiter", "SetpointLimits", "clamped", "lowe
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.80665  #: standard gravity
-_LONGEST_STEP_S = 0.2  # maximum time step: a longer pause does not allow a larger change
+_LONGEST_STEP_S = 0.2  # maximum time step, so that a longer pause does not allow a larger change
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """Return a vector (n,) in the same direction, but at most ``longest`` long; zero if a component is not finite."""
+    """Return a vector (n,), shortened if it is longer than ``longest``; zero if a component is not finite."""
     length = math.sqrt(float(vector @ vector))
     if length <= longest and length < math.inf:
         return vector
@@ -32,11 +32,11 @@ def shortened(vector: Array, longest: float) -> Array:
 
 
 def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.0) -> float:
-    """Return a number, lowered to a drone's limit if the limit is lower.
+    """Return a number, reduced to a drone's limit if the limit is lower.
 
     Args:
-        own: The number.
-        limits: Limits as in ``drone.config``; a missing name sets no limit.
+        own: The number to limit.
+        limits: Limits as in ``drone.config``; a missing name means no limit.
         name: Name of the limit.
         less: Margin to stay below the limit.
     """
@@ -46,7 +46,7 @@ def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.
 
 @dataclass(frozen=True, slots=True)
 class SetpointLimits:
-    """Limits of velocity set-points and of their rates of change; infinite means no limit.
+    """Limits on velocity set-points and their rates of change; infinite means no limit.
 
     Raises:
         UsageError: A limit is not greater than 0.
@@ -55,7 +55,7 @@ class SetpointLimits:
     speed_m_s: float = math.inf  #: horizontal speed
     climb_m_s: float = math.inf
     turn_rad_s: float = math.inf
-    acceleration_m_s2: float = math.inf  #: horizontal acceleration; more of it would tilt a camera off its target
+    acceleration_m_s2: float = math.inf  #: horizontal acceleration; more would tilt a camera off its target
     climb_acceleration_m_s2: float = math.inf
     turn_acceleration_rad_s2: float = math.inf
 
@@ -67,7 +67,7 @@ class SetpointLimits:
 
 
 def require_positive(zero: Container[str] = (), **values: float) -> None:
-    """Raise UsageError for a value that is not a finite number above 0, or at least 0 if its name is in ``zero``."""
+    """Raise UsageError unless all values are finite and greater than 0; those named in ``zero`` may be 0."""
     for name, value in values.items():
         if not (0.0 < value < math.inf or (value == 0.0 and name in zero)):
             allowed = "a finite number, 0 or more" if name in zero else "a finite number above 0"
@@ -75,7 +75,7 @@ def require_positive(zero: Container[str] = (), **values: float) -> None:
 
 
 class SetpointLimiter:
-    """Limits velocity set-points and the change from one to the next. The first may be anything."""
+    """Limits velocity set-points and the change from one to the next; the first change is not limited."""
 
     def __init__(self, limits: SetpointLimits) -> None:
         self.limits = limits
@@ -86,7 +86,7 @@ class SetpointLimiter:
 
         Args:
             wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); non-finite values count as 0.
-            dt_s: Time since the last call; counted as at most 0.2 s, so that a pause does not allow a larger step.
+            dt_s: Time since the last call; at most 0.2 s are counted, so that a pause does not allow a larger step.
         """
         limits, dt = self.limits, within(dt_s, 0.0, _LONGEST_STEP_S)
         result = np.nan_to_num(np.asarray(wanted, dtype=np.float64), posinf=0.0, neginf=0.0)
@@ -104,7 +104,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Restart from a set-point; with None the next one may be anything."""
+        """Restart from a set-point; with None, the next change is not limited."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

@@ -1,6 +1,6 @@
-"""Loading and reloading the user's controller from a Python file, with errors that give the line and the reason.
+"""Loads and reloads the user's controller from a Python file; errors state the line and the reason.
 
-A saved change to the file, or to a module next to it that it imports, is loaded without interrupting the flight.
+When the file, or a module in the same folder that it imports, is saved, it is reloaded without interrupting the flight.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError, UsageError
 
 LOOK_S: Final = 0.1  #: interval at which the files are polled
-Stamp = tuple[int, int, int]  #: value that changes when a file is saved: time [ns], size, inode
+Stamp = tuple[int, int, int]  #: modification time [ns], size and inode, which change when a file is saved
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """Load the controller class from a Python file, by its name in case the file has several.
+    """Load the controller class from a Python file; the class name is only needed if there are several.
 
-    The file is executed and can import modules next to it, as a script can. Imported classes count only if the file
-    itself defines no controller. FileFormatError names the line that can't be executed.
+    The file is executed and, like a script, can import modules from its own folder. Imported classes are considered
+    only if the file itself defines no controller. FileFormatError states the line that can't be executed.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache considers a file with the same second and size unchanged."""
+    """Always compiles the source, because Python's cache treats files with the same size and second as unchanged."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -60,7 +60,7 @@ def _run(file: Path) -> ModuleType:
     folder = str(file.resolve().parent)
     if folder not in sys.path:
         sys.path.insert(0, folder)
-    sys.modules[module_name] = module  # so that dataclasses and pickling in the user's file work
+    sys.modules[module_name] = module  # needed for dataclasses and pickling in the user's file
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
@@ -91,7 +91,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Return which line of the user's file raised an exception; empty if it was raised elsewhere."""
+    """Return the line of the user's file that raised an exception, as text; empty if it was raised elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -106,7 +106,7 @@ def _is(name: str | None, file: Path) -> bool:
 
 
 def load_module(file: Path, what: str) -> ModuleType:
-    """Execute a Python file as a separate module; ``what`` it should contain is a noun phrase for the error message."""
+    """Execute a Python file as a separate module; ``what`` names the expected content in the error message."""
     if file.is_dir():
         raise UsageError(f"{file} is a directory: give a Python file in it")
     if not file.exists():
@@ -117,11 +117,11 @@ def load_module(file: Path, what: str) -> ModuleType:
 class Reloader:
     """Watches a controller's file and reloads it on a background thread after each save. A context manager.
 
-    A file counts as saved when it has not changed for ``look_s / 2``, so that no half-written file is loaded.
+    A file counts as saved once it has not changed for ``look_s / 2``, so that no half-written file is loaded.
     """
 
     def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
-        """Record the state of the files, polled each ``look_s``. The thread starts when the context is entered."""
+        """Record the files' state, to be polled every ``look_s``. The thread starts when the context is entered."""
         self._path = Path(path)
         self._folder = self._path.resolve().parent
         self._class_name = class_name
@@ -153,7 +153,7 @@ class Reloader:
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
-        """Return the new class, or the error that prevented loading it; None if nothing has been saved since."""
+        """Return the new class or the error that prevented loading it; None if there is nothing new."""
         return self._loaded.popleft() if self._loaded else None
 
     def look(self) -> None:
@@ -169,7 +169,7 @@ class Reloader:
             self._loaded.append(self._load())
         except SkyloopError as error:
             self._loaded.append(error)
-        self._seen = {**self._stamps(), **found}  # watch modules that the new version imports, too
+        self._seen = {**self._stamps(), **found}  # also watch modules imported by the new version
 
     def _settled(self) -> dict[Path, Stamp]:
         self._ended.wait(self._look_s / 2)
@@ -180,7 +180,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Reload the file and its neighbouring modules; on failure restore the previously loaded ones."""
+        """Reload the file and the modules in its folder; on failure, restore those loaded before."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -191,7 +191,7 @@ class Reloader:
             raise
 
     def _neighbours(self) -> dict[str, ModuleType]:
-        """Return the loaded modules in the folder of the user's file, including that file."""
+        """Return the loaded modules from the folder of the user's file, including the file itself."""
         loaded = dict(sys.modules)
         tops = {name for name in loaded if "." not in name and self._lies_here(name, loaded[name])}
         return {name: module for name, module in loaded.items() if name.partition(".")[0] in tops and _file(module)}
@@ -213,7 +213,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None while the file is missing, such as during its replacement."""
+    """Return a stamp that changes with each save; None if the file is missing, for example during its replacement."""
     try:
         found = file.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Flying by a learned policy: a network in an ONNX file that maps an image and the state to a set-point."""
+"""Flight by a learned policy: a network in an ONNX file that maps an image and the state to a set-point."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ STATE_INPUT: Final = "observation.state"
 IMAGE_INPUT: Final = "observation.images."
 OUTPUT: Final = "action"
 MEMORY: Final = "memory"
-NEXT_MEMORY: Final = "next_memory"  #: name of the output that becomes the memory for the next image
-STATE_NAMES: Final = "skyloop.state"  #: metadata key for the names of the state's numbers, a JSON list
-ACTION_NAMES: Final = "skyloop.action"  #: metadata key for the names of the action's numbers
+NEXT_MEMORY: Final = "next_memory"  #: output that becomes the memory input for the next image
+STATE_NAMES: Final = "skyloop.state"  #: metadata key for a JSON list of the names of state values
+ACTION_NAMES: Final = "skyloop.action"  #: metadata key for the names of action values
 _MOST_SIDE: Final = 4096  # maximum side of an input image [px]
-_MOST_MEMORY: Final = 2**20  # maximum size of a memory, in numbers
+_MOST_MEMORY: Final = 2**20  # maximum number of values in the memory
 _PURPOSE: Final = "flying by an ONNX file"
 
 
@@ -50,29 +50,28 @@ class PolicyPhase(StrEnum):
 class PolicyNetwork:
     """A policy's network. Call it from one thread only.
 
-    The file has an input ``observation.images.CAMERA`` of float32 (1, 3, height, width), red, green, blue, 0 to 1, and
-    may have ``observation.state`` of float32 (1, n). Its output is ``action`` of (1, m). Names and numbers match those
-    of ``skyloop log export --to lerobot``. The metadata lists the numbers' names as JSON lists in ``skyloop.state`` and
-    ``skyloop.action``. A network with memory has an input ``memory``, float32 of a fixed shape, and an output
-    ``next_memory`` of the same shape, which becomes ``memory`` for the next image. The memory starts as zeros.
+    The network has an input ``observation.images.CAMERA``, float32 (1, 3, height, width), with red, green and blue from
+    0 to 1, and may have an input ``observation.state``, float32 (1, n). Its output is ``action``, (1, m). Names and
+    values match those of ``skyloop log export --to lerobot``. The metadata ``skyloop.state`` and ``skyloop.action``
+    list the values' names in JSON. A network with memory has an input ``memory``, float32 of a fixed shape, and an
+    output ``next_memory`` of the same shape, which becomes ``memory`` for the next image. The memory is initially zero.
 
     Args:
         path: The ONNX file.
-        state: Names of the state's numbers, from :data:`~skyloop.messages.rows.STATE`; None to read the metadata.
+        state: Names of the state values, from :data:`~skyloop.messages.rows.STATE`; None to read the metadata.
         action: ``velocity`` or ``attitude``; None to read the metadata.
         threads: CPU threads for one run, 1 to 64.
 
     Attributes:
-        camera: The camera on whose images the network was trained.
-        size: Width and height of its input images [px]; other images are scaled.
-        state: Names of the state's numbers.
-        action: ``velocity`` or ``attitude``.
+        camera: Name of the camera whose images the network was trained on.
+        size: Width and height of input images [px]; other images are scaled.
+        state: Names of the state values. action: ``velocity`` or ``attitude``.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.
-        UnknownNameError: A name of one of the state's numbers, or of the action, is unknown.
-        UsageError: There is no such file, or an argument is out of its range or contradicts the file.
-        FileFormatError: It is not an ONNX file, or its inputs, outputs or metadata are not as described above.
+        UnknownNameError: The name of a state value or of the action is unknown.
+        UsageError: There is no such file, or an argument is out of range or contradicts the file.
+        FileFormatError: The file is not an ONNX file, or its inputs, outputs or metadata are not as described above.
     """
 
     def __init__(
@@ -100,17 +99,17 @@ class PolicyNetwork:
         self.forget()
 
     def __call__(self, image: NDArray[np.uint8], state: Sequence[float]) -> Velocity | Attitude:
-        """Compute the set-point, and keep the network's memory for the next image.
+        """Compute the set-point and store the network's memory for the next image.
 
         Args:
-            image: BGR, shape (height, width, 3), or grey (height, width), uint8, of any size.
-            state: Numbers in the order of :attr:`state`.
+            image: A BGR image, (height, width, 3), or grey image, (height, width), uint8, of any size.
+            state: Values in the order of :attr:`state`.
 
         Returns:
-            The set-point; its values are not necessarily finite.
+            The set-point, whose values may not be finite.
 
         Raises:
-            FileFormatError: The network can't be run, or its action has a wrong number of values.
+            FileFormatError: The network can't be run, or its action has the wrong number of values.
         """
         if image.ndim == 2:
             image = self._cv.cvtColor(image, self._cv.COLOR_GRAY2BGR)
@@ -144,7 +143,7 @@ class PolicyNetwork:
         if memory.shape != self._blank.shape:
             raise FileFormatError(
                 f"{self._path} takes {MEMORY} as {self._blank.shape} and gives {NEXT_MEMORY} as {memory.shape}: "
-                "they must be alike"
+                "the two must match"
             )
         # Non-finite values would stay in the memory forever.
         self._memory = memory if np.isfinite(memory).all() else self._blank
@@ -230,10 +229,10 @@ _ACTIONS: Final = " or ".join(f"{kind} ({', '.join(names)})" for kind, names in 
 class OnnxPolicy(Behaviour):
     """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
-    The proxy's limits, zones and failsafe apply as for any application. The vehicle hovers, and an event reports it, if
-    frames stop, if a number of the state that the network needs is missing or half a second old, or if the action is
-    not finite. Each of these clears the network's memory. The vehicle must be airborne when :meth:`run` is called. All
-    callbacks run on the thread that called it.
+    The proxy's limits, zones and failsafe apply as for any application. The vehicle hovers, and an event reports why,
+    if no frames arrive, if a state value that the network needs is missing or half a second old, or if the action is
+    not finite. In each case the network's memory is cleared. The vehicle must be airborne when :meth:`run` is called.
+    All callbacks run on the thread that called it.
     """
 
     name = "policy"
@@ -255,13 +254,13 @@ class OnnxPolicy(Behaviour):
             drone: The drone to fly.
             path: The ONNX file; see :class:`PolicyNetwork`.
             camera: Camera to use; None for the camera named in the file.
-            state: Names of the state's numbers, in case the file does not give them.
-            action: ``velocity`` or ``attitude``, in case the file does not give it.
+            state: Names of the state values, if not stated in the file.
+            action: ``velocity`` or ``attitude``, if not stated in the file.
             threads: CPU threads for one image.
 
         Raises:
             MissingExtraError: ONNX Runtime or OpenCV is not installed.
-            UsageError: There is no such file, or an argument is out of its range.
+            UsageError: There is no such file, or an argument is out of range.
             UnknownNameError: The vehicle has no such camera, or a name is unknown.
             FileFormatError: The file is not a policy.
         """
@@ -273,11 +272,11 @@ class OnnxPolicy(Behaviour):
 
     @property
     def phase(self) -> PolicyPhase:
-        """The current phase: whether it is flying or why it is not."""
+        """The current phase: whether the policy is flying or why it is not."""
         return self._phase
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Compute a frame's set-point and annotate the frame with it."""
+        """Compute the set-point for a frame and annotate the frame with it."""
         if frame.captured_ns - self._looked_at_ns > nanoseconds(BLIND_S):
             self.network.forget()
         self._looked_at_ns = frame.captured_ns
@@ -308,7 +307,7 @@ class OnnxPolicy(Behaviour):
 
 
 class _Newest:
-    """The law of a behaviour that gets its set-points from :meth:`Behaviour.look`."""
+    """The control law of a behaviour whose set-points are computed in :meth:`Behaviour.look`."""
 
     def __init__(self) -> None:
         self.wanted: Velocity | Attitude = Velocity()
@@ -316,5 +315,5 @@ class _Newest:
     def feedback(self, feedback: Feedback) -> None:
         pass
 
-    def step(self, now_ns: int) -> Velocity | Attitude:  # noqa: ARG002  as laws are called
+    def step(self, now_ns: int) -> Velocity | Attitude:  # noqa: ARG002  (the signature of a law)
         return self.wanted

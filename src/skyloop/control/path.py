@@ -1,7 +1,7 @@
-"""Paths: position and velocity over time. World axes x east, y north, z up [m]. Pure.
+"""Paths, which give position and velocity over time, in world axes: x east, y north, z up [m]. Pure.
 
-Every object with the attributes of :class:`Path` is a path. All paths in this module except :class:`FunctionPath` start
-and end at rest: each stretch has its own speed limit, and the speeds at the joints come from one backward and one
+Any object with the attributes of :class:`Path` is a path. All paths in this module except :class:`FunctionPath` start
+and end at rest. Each stretch has its own speed limit, and the speeds at the joints are found by one backward and one
 forward pass with ``v² = v₀² + 2·a·s`` (a trapezoidal profile; Biagiotti and Melchiorri, "Trajectory Planning for
 Automatic Machines and Robots", Springer 2008, section 3.2).
 """
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from skyloop.control.limiting import Array, within
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Shorter stretches are skipped because the squares of their speeds would underflow a float.
+#: Length up to which stretches are skipped, because the squares of their speeds would underflow a float.
 SHORTEST_M: Final = 1e-9
 
 
@@ -31,9 +31,9 @@ class MotionProfile:
     def __init__(self, stretches: Sequence[tuple[float, float]], acceleration_m_s2: float) -> None:
         """Compute the profile from the length [m] and maximum speed [m/s] of each stretch.
 
-        Speed 0 with length 0 is a stop. Stretches of at most :data:`SHORTEST_M` take no time.
+        A stop is a stretch with length 0 and speed 0. Stretches no longer than :data:`SHORTEST_M` take no time.
         """
-        #: Start [s, m], speed and acceleration of each piece.
+        #: Start time [s], start distance [m], speed and acceleration of each piece.
         self._pieces: list[tuple[float, float, float, float]] = []
         self.duration_s = 0.0  #: duration of the whole profile
         self.length_m = 0.0  #: length of the whole profile
@@ -73,7 +73,7 @@ class MotionProfile:
 
 
 def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[float]:
-    """Return the speeds before the first stretch, between stretches and after the last."""
+    """Return the speeds at the start of the first stretch, between stretches and at the end of the last one."""
     limits = [limit for _, limit in stretches]
     speeds = [0.0, *(min(pair) for pair in itertools.pairwise(limits)), 0.0]
     for k in range(len(stretches) - 1, -1, -1):
@@ -83,15 +83,15 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
     return speeds
 
 
-_DIFFERENCE_S = 0.01  # step of the numerical derivative on either side
+_DIFFERENCE_S = 0.01  # step of the numerical derivative to either side
 
-#: Lengths, speeds, accelerations and times in this range can be divided without under- or overflow.
+#: Range of lengths, speeds, accelerations and times that can be divided without underflow or overflow.
 _LEAST: Final = 1e-6
 _MOST: Final = 1e6
 
 
 class Path(Protocol):
-    """Position and velocity at each time from 0 to ``duration_s``, and at rest at either end before and after that."""
+    """Position and velocity over time, from 0 to ``duration_s``; outside this interval, the path stays at its ends."""
 
     @property
     def duration_s(self) -> float: ...
@@ -119,9 +119,9 @@ class FunctionPath:
         """Initialise the path.
 
         Args:
-            position: Returns x, y, z [m] at a time from 0 to ``duration_s``.
+            position: A function that returns x, y, z [m] at a time from 0 to ``duration_s``.
             duration_s: Duration of the path.
-            velocity: Returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
+            velocity: A function that returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
 
         Raises:
             UsageError: The duration is not between 1e-6 and 1e6 s.
@@ -162,7 +162,7 @@ class _Profiled:
 
 
 class Polyline(_Profiled):
-    """Straight legs between points at one speed, with a stop at each corner or with corners rounded by arcs."""
+    """Straight legs between points at a constant speed, with stops at the corners or arcs that round them."""
 
     def __init__(
         self,
@@ -178,11 +178,11 @@ class Polyline(_Profiled):
             points: Points, each (3,) [m], at least two of which differ.
             speed_m_s: Speed along the legs.
             acceleration_m_s2: Acceleration at the start and end, at stops, and across the arcs.
-            corner_m: Distance before its corner at which an arc starts, at most half a leg. On the arc the vehicle is
-                no faster than its acceleration allows. 0 stops at each corner.
+            corner_m: Distance from the corner at which an arc starts, at most half a leg; 0 means a stop at each
+                corner. On an arc the vehicle flies no faster than the acceleration allows.
 
         Raises:
-            UsageError: Fewer than two points are different, or a number is out of its range.
+            UsageError: There are fewer than two different points, or a number is out of range.
         """
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
         if not 0.0 <= corner_m < math.inf:
@@ -226,7 +226,7 @@ class Polyline(_Profiled):
 
 
 class Circle(_Profiled):
-    """A circle around a centre at constant height and speed, starting and ending at rest."""
+    """A circle flown at constant height and speed, starting and ending at rest."""
 
     def __init__(
         self,
@@ -246,12 +246,12 @@ class Circle(_Profiled):
             radius_m: Radius of the circle.
             speed_m_s: Speed along the circle.
             laps: Number of laps.
-            begin_rad: Starting angle on the circle, counter-clockwise from east.
-            clockwise: Direction as seen from above.
+            begin_rad: Angle at which the circle starts, counter-clockwise from east.
+            clockwise: Whether to fly clockwise as seen from above.
             acceleration_m_s2: Acceleration at the start and end.
 
         Raises:
-            UsageError: A number is out of its range.
+            UsageError: A number is out of range.
         """
         self._centre = _point(centre)
         self._radius = _positive("radius_m", radius_m)
@@ -277,7 +277,7 @@ class Circle(_Profiled):
 
 
 class Lemniscate(_Profiled):
-    """A horizontal figure of eight (Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``) turned by ``yaw_rad``."""
+    """A horizontal figure of eight (Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``), rotated by ``yaw_rad``."""
 
     def __init__(
         self,
@@ -289,25 +289,25 @@ class Lemniscate(_Profiled):
         yaw_rad: float = 0.0,
         acceleration_m_s2: float = 0.8,
     ) -> None:
-        """Initialise the path, which starts in the centre.
+        """Initialise the path, which starts at its centre.
 
         Args:
             centre: x, y, z [m].
             half_width_m: ``a``, the distance from the centre to each end.
-            speed_m_s: Maximum speed, reached in the centre.
+            speed_m_s: Maximum speed, which is reached at the centre.
             laps: Number of laps.
-            yaw_rad: Angle by which to turn the figure counter-clockwise.
+            yaw_rad: Counter-clockwise rotation of the figure.
             acceleration_m_s2: Acceleration at the start and end.
 
         Raises:
-            UsageError: A number is out of its range.
+            UsageError: A number is out of range.
         """
         self._centre = _point(centre)
         self._a = _positive("half_width_m", half_width_m)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
-        steepest = self._a * math.sqrt(2.0)  # maximum distance per unit of u
+        steepest = self._a * math.sqrt(2.0)  # maximum distance flown per unit of u
         turns = 2 * math.pi * _positive("laps", laps)
         self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
 
@@ -324,7 +324,7 @@ class Lemniscate(_Profiled):
 
 
 class Spline:
-    """A smooth curve through points at given times that is at rest at both ends: SciPy's clamped cubic spline.
+    """SciPy's clamped cubic spline: a smooth curve through points at given times, at rest at both ends.
 
     Attributes:
         duration_s: Duration of the path.
@@ -338,7 +338,7 @@ class Spline:
             times_s: Time at each point, starting at 0 and increasing.
 
         Raises:
-            UsageError: The number of times does not match the points, or the times don't start at 0 or don't increase.
+            UsageError: There are more or fewer times than points, or the times don't start at 0 or don't increase.
             MissingExtraError: SciPy is not installed.
         """
         places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)
@@ -376,7 +376,7 @@ class _Leg:
     def point(self, way: float) -> Array:
         return self._begin + self._direction * way
 
-    def direction(self, way: float) -> Array:  # noqa: ARG002  (as an arc's)
+    def direction(self, way: float) -> Array:  # noqa: ARG002  (same signature as _Arc)
         return self._direction
 
 
@@ -384,7 +384,7 @@ class _Arc:
     """A circular arc that leaves one leg and joins the next."""
 
     def __init__(self, corner: Array, before: Array, after: Array, reach: float, turn: float) -> None:
-        """Compute the arc from the legs' directions, the distance ``reach`` to the arc's ends, and the angle [rad]."""
+        """Compute the arc from the legs' directions, the distance from its ends to the corner, and the angle [rad]."""
         self.begin, self.end = corner - before * reach, corner + after * reach
         self.radius = reach / math.tan(turn / 2)
         self.length = self.radius * turn

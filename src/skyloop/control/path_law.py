@@ -1,9 +1,9 @@
-"""A law that keeps a vehicle on a path, from positions to velocities, and the controllers that fly it.
+"""A control law that keeps a vehicle on a path, computing velocities from positions, and controllers that use it.
 
-The path's velocity is fed forward, ahead of time by the vehicle's response time, and a PI loop on the position removes
-the remaining error. The integral counteracts wind and a wrongly measured velocity (Åström and Hägglund, "Advanced PID
-Control", ISA 2006, chapter 5). A measured position is compared with the path at the time of the measurement, so its
-delay causes no error.
+The path's velocity is fed forward with the vehicle's response time as lead, and a PI controller for the position
+removes the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund,
+"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so
+delays cause no error.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from skyloop.messages.geometry import turned, wrap_angle
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-_LONGEST_STEP_S = 0.5  # maximum time by which the path advances between two fixes
+_LONGEST_STEP_S = 0.5  # maximum advance of the path's time between two fixes
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
 _SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
-_ALONG_M_S = 0.05  # minimum speed with a direction worth turning to
-_NEAR_M = 0.3  # minimum horizontal distance to a point for a reliable bearing
-_AHEAD_S = 0.1  # interval over which the rate of the wanted yaw is computed
+_ALONG_M_S = 0.05  # minimum speed for the direction of flight to determine the yaw
+_NEAR_M = 0.3  # minimum horizontal distance to a point for its bearing to be reliable
+_AHEAD_S = 0.1  # interval for computing the rate of the wanted yaw
 
 
 class YawMode(Protocol):
-    """Chooses the yaw from the path's position and velocity, both (3,) in world axes.
+    """A function that chooses the yaw, given the path's position and velocity, both (3,) in world axes.
 
-    Returns the yaw [rad], or None to keep the current one.
+    It returns the yaw [rad], or None to keep the current yaw.
     """
 
     def __call__(self, position: Array, velocity: Array) -> float | None: ...
@@ -97,22 +97,22 @@ class PathSettings:
     """Gains, limits and acceptance radii of :class:`PathLaw`. The defaults suit a small indoor vehicle.
 
     Raises:
-        UsageError: A number is out of its range.
+        UsageError: A number is out of range.
     """
 
-    #: Gains of the position error [1/s, 1/s²]; ``velocity_gain`` replaces the derivative.
+    #: Gains for the position error [1/s, 1/s²]; ``velocity_gain`` replaces the derivative gain.
     gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))
-    #: Fraction of the velocity error (if the velocity is known) that is added to the set-point: a vehicle with a soft
-    #: velocity loop responds sooner, and gusts push it less far.
+    #: Fraction of the velocity error that is added to the set-point if the velocity is known. Vehicles with a soft
+    #: velocity loop then respond sooner and are pushed less far by gusts.
     velocity_gain: float = 1.0
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.25  #: response time to a set-point; the velocity is fed forward this far ahead
+    lead_s: float = 0.25  #: the vehicle's response time, by which the velocity is fed forward
     limits: SetpointLimits = field(
         default_factory=lambda: SetpointLimits(
             speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0
         )
     )
-    leash_m: float = 0.5  #: distance from the target beyond which the path slows down; beyond twice this it waits
+    leash_m: float = 0.5  #: distance from the target at which the path slows down; at twice this distance it waits
     near_m: float = 0.15  #: acceptance radius
     near_rad: float = 0.15  #: maximum acceptable yaw error
 
@@ -120,14 +120,14 @@ class PathSettings:
         numbers = (*_MAY_BE_ZERO, "leash_m", "near_m", "near_rad")
         require_positive(_MAY_BE_ZERO, **{name: getattr(self, name) for name in numbers})
         if self.gains.d > 0.0:
-            raise UsageError(f"gains.d is {self.gains.d!r} and must be 0: velocity_gain damps")
+            raise UsageError(f"gains.d is {self.gains.d!r} and must be 0, because velocity_gain provides damping")
 
     def within(self, limits: Mapping[str, Value]) -> PathSettings:
-        """Return these settings clamped to a drone's limits: higher speeds would wind up the integral.
+        """Return these settings clamped to a drone's limits, because higher speeds would wind up the integral.
 
         Args:
-            limits: ``limits.speed``, ``limits.climb`` and ``limits.yaw_rate``, as in ``drone.config``; a missing one
-                sets no limit.
+            limits: ``limits.speed``, ``limits.climb`` and ``limits.yaw_rate``, as in ``drone.config``; missing ones
+                have no effect.
         """
         own = self.limits
         return replace(
@@ -142,19 +142,19 @@ class PathSettings:
 
 
 class PathLaw:
-    """Computes velocities from fixes. The path's time starts with the first fix."""
+    """Computes velocities from position fixes; the path's time starts with the first fix."""
 
     def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
-        """Initialise the law.
+        """Initialise the control law.
 
         Args:
             path: The path, in world axes.
-            settings: Settings of the law; None for the defaults.
-            yaw: Chooses the yaw; None keeps the yaw of the first fix.
+            settings: Settings for the control law; None for the defaults.
+            yaw: The yaw mode; None keeps the yaw of the first fix.
         """
         self.settings = settings or PathSettings()
         self.time_s = 0.0  #: current time on the path
-        self.off_m = 0.0  #: distance from the target on the path at the last fix
+        self.off_m = 0.0  #: distance from the path's target at the last fix
         self._path = path
         self._yaw = yaw
         limits = self.settings.limits
@@ -166,7 +166,7 @@ class PathLaw:
 
     @property
     def over(self) -> bool:
-        """Whether the path's time has ended."""
+        """Whether the path's time is up."""
         return self.time_s >= self._path.duration_s
 
     @property
@@ -175,32 +175,32 @@ class PathLaw:
         return self._path.position(self.time_s), self._path.velocity(self.time_s)
 
     def follow(self, path: Path, yaw: YawMode | None = None) -> None:
-        """Continue with another path from its start while keeping the integrals.
+        """Continue with another path from its start, keeping the integral.
 
         Args:
             path: The path, in world axes.
-            yaw: Chooses the yaw; None keeps the current mode.
+            yaw: The new yaw mode; None keeps the current one.
         """
         self._path, self.time_s = path, 0.0
         if yaw is not None:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Restart from rest with zero integral: the vehicle hovers or another client flies it; the path waits."""
+        """Pause the path because the vehicle hovers or another client flies it; restart from rest without integral."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None
 
     def there(self, fix: Fix) -> bool:
-        """Return whether the path is over and the vehicle is at its end with the wanted yaw."""
+        """Return whether the path's time is up and the vehicle is at its end with the wanted yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
 
     def step(self, fix: Fix) -> Velocity:
-        """Compute the set-point for a fix. A fix that is no newer than the last one does not advance the path.
+        """Compute the set-point for a fix; the path advances only if the fix is newer than the last one.
 
-        A fix with non-finite values pauses the flight.
+        Fixes with non-finite values pause the flight.
         """
         if not fix.finite:
             self.pause()
@@ -224,7 +224,7 @@ class PathLaw:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
-        """Advance the path's time: slower beyond the leash, and not at all beyond twice the leash."""
+        """Advance the path's time, more slowly beyond the leash and not at all beyond twice the leash."""
         share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 
@@ -246,7 +246,7 @@ APPROACH_M_S: Final = 0.5  #: speed on the way to the start of a path
 
 @dataclass(slots=True)
 class TrackingError:
-    """Statistics of the distance between the vehicle and its target on the path."""
+    """Statistics on the distance between the vehicle and its target on the path."""
 
     samples: int = 0
     largest_m: float = 0.0
@@ -265,7 +265,7 @@ class TrackingError:
 
 
 class _PathFlyer(Controller):
-    """Common base of both controllers: a law and a position source. Hovers while the source has no position."""
+    """The base class for both controllers, which hover while their position source provides no position."""
 
     def __init__(
         self,
@@ -279,9 +279,9 @@ class _PathFlyer(Controller):
         if not 0.0 < max_age_s < math.inf:
             raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds above 0")
         self.settings = (settings or PathSettings()).within(dict(drone.config.items()))
-        self.error = TrackingError()  #: distance from the target, according to the position source
-        self.done = False  #: the whole path has been flown
-        self.lost = False  #: the vehicle hovers because the position is unknown
+        self.error = TrackingError()  #: distance from the target as measured by the position source
+        self.done = False  #: whether the whole path has been flown
+        self.lost = False  #: whether the vehicle hovers because its position is unknown
         self._yaw = yaw
         self._source = source
         self._max_age_ns = nanoseconds(max_age_s)
@@ -318,11 +318,11 @@ class _PathFlyer(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _begin(self, fix: Fix) -> PathLaw:
-        """Create the law for the first fix."""
+        """Create the control law from the first fix."""
         raise NotImplementedError
 
     def _look(self, law: PathLaw, fix: Fix) -> None:
-        """Decide on the next leg after each step."""
+        """Decide how to continue after each step."""
         raise NotImplementedError
 
     def _finish(self) -> None:
@@ -340,16 +340,16 @@ class _PathFlyer(Controller):
 
 
 class FollowPath(_PathFlyer):
-    """Flies to a path's start and along the path, and hovers at its end. Then :meth:`run` returns.
+    """Flies to the start of a path, follows it and hovers at its end. Then :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         path: The path.
-        on_path: Whether the vehicle has reached the start.
-        error: Tracking error from the path's start to its end.
+        on_path: Whether the vehicle has reached the start of the path.
+        error: Tracking error from the start of the path to its end.
         done: Whether the whole path has been flown.
-        lost: Whether the vehicle hovers because the position is unknown.
+        lost: Whether the vehicle hovers because its position is unknown.
     """
 
     def __init__(
@@ -368,16 +368,16 @@ class FollowPath(_PathFlyer):
             drone: The drone to fly.
             path: The path, in world axes.
             yaw: A :class:`skyloop.control.YawMode`; None keeps the current yaw.
-            settings: Settings of the law; None for the defaults.
+            settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
-            max_age_s: Maximum age of a position; if it is older, the vehicle hovers.
+            max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.
 
         Raises:
             UsageError: ``max_age_s`` is not a finite number greater than 0.
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.path = path
-        self.on_path = False  #: the vehicle has reached the start
+        self.on_path = False  #: whether the vehicle has reached the start
 
     def _begin(self, fix: Fix) -> PathLaw:
         return PathLaw(_way(fix.position_m, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
@@ -395,16 +395,16 @@ class FollowPath(_PathFlyer):
 
 
 class Waypoints(_PathFlyer):
-    """Flies straight from waypoint to waypoint, staying at each, and then hovers; :meth:`run` returns.
+    """Flies straight from waypoint to waypoint, stays at each and hovers at the last. Then :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         waypoints: The waypoints.
         reached: Number of waypoints reached.
-        error: Distance from the moving target over the whole flight.
+        error: Statistics on the distance from the moving target during the flight.
         done: Whether the vehicle has reached the last waypoint.
-        lost: Whether the vehicle hovers because the position is unknown.
+        lost: Whether the vehicle hovers because its position is unknown.
     """
 
     def __init__(
@@ -427,14 +427,14 @@ class Waypoints(_PathFlyer):
             waypoints: Waypoints as :class:`Waypoint` or (x, y, z) in world axes [m].
             speed_m_s: Maximum speed between waypoints.
             acceleration_m_s2: Acceleration at the start and end of each leg.
-            hold_s: How long to stay at each waypoint.
+            hold_s: Time to stay at each waypoint.
             yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None keeps the current yaw.
-            settings: Settings of the law; None for the defaults.
+            settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
-            max_age_s: Maximum age of a position; if it is older, the vehicle hovers.
+            max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.
 
         Raises:
-            UsageError: There are no waypoints, or a number is out of its range.
+            UsageError: There are no waypoints, or a number is out of range.
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.waypoints = tuple(one if isinstance(one, Waypoint) else Waypoint(*one) for one in waypoints)
@@ -445,8 +445,8 @@ class Waypoints(_PathFlyer):
         self.reached = 0
         self._speed = (speed_m_s, acceleration_m_s2)
         self._hold_ns = nanoseconds(hold_s)
-        self._there_ns: int | None = None  # time of arrival at the next waypoint
-        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises here if speed or acceleration is out of range
+        self._there_ns: int | None = None  # time of arrival at the current waypoint
+        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises an error if an argument is out of range
 
     def _begin(self, fix: Fix) -> PathLaw:
         goal = self.waypoints[0]
@@ -486,7 +486,7 @@ class _Stay:
 
 
 def _way(begin: Vector, end: Vector, speed_m_s: float, acceleration_m_s2: float = 0.8) -> Path:
-    """Return a straight path, or one that stays in place if both ends are equal."""
+    """Return a straight path, or a stationary one if both ends are equal."""
     if math.dist(begin, end) < 1e-6:
         return _Stay(end)
     return Polyline([begin, end], speed_m_s=speed_m_s, acceleration_m_s2=acceleration_m_s2)

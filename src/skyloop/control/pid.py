@@ -1,9 +1,9 @@
-"""A PID controller for a number and a PI controller for a vector. Pure: the time step is an argument.
+"""A PID controller for scalars and a PI controller for vectors. Pure; the time step is an argument.
 
-Both follow Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is
-filtered (section 3.3); what a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains
-cause no jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's
-integral grows only as far as later limits let its output through (conditional integration, section 3.5).
+Both follow Åström and Hägglund, "Advanced PID Control", ISA 2006. The derivative acts on the measurement and is
+filtered (section 3.3). The part of the output cut off by limits is fed back into the integral (back-calculation,
+section 3.5). New gains don't make the output jump, because the integral term is stored, not the integral (section 3.6).
+The vector controller stops integrating along axes with limited output (conditional integration, section 3.5).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from skyloop.messages.geometry import wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Gains for the error, its integral and its derivative, with their time constants.
+    """Gains for the error, its integral and its derivative, with the associated time constants.
 
     Raises:
         UsageError: A number is negative or not finite.
     """
 
     p: float = 1.0  #: output per unit of error
-    i: float = 0.0  #: output per unit of error and second
-    d: float = 0.0  #: output per change of the measurement per second
-    derivative_filter_s: float = 0.05  #: time constant of the low pass before the derivative
-    #: Time constant of the integral term following a limited output; None uses p/i, or none without p.
+    i: float = 0.0  #: output per unit of error per second
+    d: float = 0.0  #: output per unit of the measurement's rate of change
+    derivative_filter_s: float = 0.05  #: time constant of the derivative's low-pass filter
+    #: Time constant with which the integral term follows a limited output; None means p/i.
     tracking_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -47,10 +47,10 @@ class Gains:
 
 
 class Pid:
-    """A PID loop for a number.
+    """A PID controller for a scalar.
 
-    :attr:`gains` can be replaced in flight. With an integral gain the output does not jump, because the integral term
-    absorbs the difference; without one the output changes no faster than the rate limit allows.
+    :attr:`gains` can be replaced in flight. If the new integral gain is not 0, the output does not jump, because the
+    integral term absorbs the difference; otherwise the output changes no faster than the rate limit allows.
     """
 
     def __init__(
@@ -62,14 +62,14 @@ class Pid:
         rate: float = math.inf,
         angle: bool = False,
     ) -> None:
-        """Initialise the loop.
+        """Initialise the controller.
 
         Args:
             gains: Initial gains.
             low: Minimum output.
             high: Maximum output.
             rate: Maximum change of the output per second.
-            angle: Whether set-point and measurement are angles [rad], whose difference is the shorter way around.
+            angle: Whether set-point and measurement are angles [rad], whose difference is taken the shorter way around.
 
         Raises:
             UsageError: ``low`` is not less than ``high``, or ``rate`` is not greater than 0.
@@ -101,7 +101,7 @@ class Pid:
             slope = self._slope.value or 0.0
             self._integral += (old.p - new.p) * self._error - (old.d - new.d) * slope
         elif old.i > 0.0:
-            self._integral = 0.0  # nothing would ever remove it
+            self._integral = 0.0  # without an integral gain, it would stay forever
         self._slope.time_constant_s = new.derivative_filter_s
         self._gains = new
 
@@ -117,10 +117,10 @@ class Pid:
             set_point: The wanted value.
             measured: The measured value, in the same unit.
             dt_s: Time since the last measurement [s].
-            feed_forward: Value that is added to the output before the limits.
+            feed_forward: Value added to the output before the limits are applied.
 
         Returns:
-            The output, within ``low`` and ``high`` and the rate limit; unchanged if an argument is not finite.
+            The output, between ``low`` and ``high`` and within the rate limit; unchanged if an argument is not finite.
         """
         if not all(map(math.isfinite, (set_point, measured, feed_forward, dt_s))):
             return 0.0 if self._output is None else self._output
@@ -134,15 +134,15 @@ class Pid:
         limited = within(self._unlimited, self._low, self._high)
         if self._output is not None and self._rate < math.inf:
             nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
-            # Rounding may take the sum one bit beyond the limit.
+            # Rounding may carry the sum one bit beyond the limit.
             limited = min(nearer, limited) if limited >= self._output else max(nearer, limited)
         self.applied(limited)
         return limited
 
     def applied(self, output: float) -> None:
-        """Report the output actually applied, if a limit outside this loop reduced it.
+        """Report the output that was actually applied, in case a limit outside this controller reduced it.
 
-        The integral term follows it (back-calculation). :meth:`step` calls this with its own limited output.
+        The integral term follows it (back-calculation). :meth:`step` calls this method with its own limited output.
 
         Args:
             output: The applied output.
@@ -153,14 +153,14 @@ class Pid:
         self._output = output
 
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
-        """Restart with the integral term that makes ``output`` the next output, so that taking over causes no jump.
+        """Restart with an integral term that makes the next output equal to ``output``, to avoid a jump on takeover.
 
-        Without an integral gain, the error and the derivative alone determine the next output.
+        Without an integral gain, the next output depends only on the error and the derivative.
 
         Args:
-            output: The output applied until now.
+            output: The output applied so far.
             set_point: The current set-point.
-            measured: The current measured value; None assumes an error of 0.
+            measured: The current measured value; None means an error of 0.
         """
         self._error = 0.0 if measured is None else self._difference(set_point, measured)
         self._integral = output - self._gains.p * self._error if self._gains.i > 0.0 else 0.0
@@ -172,17 +172,17 @@ class Pid:
 
 
 class VectorPi:
-    """A PI loop for a vector. Its integral grows only as far as the output is applied, and not during pauses.
+    """A PI controller for vectors. Its integral doesn't grow along axes with limited output or during pauses.
 
     Attributes:
         integral: The integral term, (n,), in units of the output.
     """
 
     def __init__(self, gains: Gains, dimensions: int, *, most: float = math.inf) -> None:
-        """Initialise the loop.
+        """Initialise the controller.
 
         Args:
-            gains: The gains; the derivative's and ``tracking_s`` are unused.
+            gains: The gains, of which the derivative gain and ``tracking_s`` are unused.
             dimensions: Length of the vector.
             most: Maximum magnitude of the integral term.
         """
@@ -191,21 +191,21 @@ class VectorPi:
         self._before = self.integral = np.zeros(dimensions)
 
     def step(self, error: Array, dt_s: float) -> Array:
-        """Return the output (n,) for an error (n,) that lasted ``dt_s`` [s]; call :meth:`applied` afterwards."""
+        """Return the output (n,) for an error (n,) over a time step [s]; call :meth:`applied` afterwards."""
         self._before = self.integral
         self.integral = shortened(self.integral + self.gains.i * error * dt_s, self._most)
         return self.gains.p * error + self.integral
 
     def applied(self, asked: Array, applied: Array) -> None:
-        """Undo the integral's growth along the axes in which limits cut the output off.
+        """Undo the integral's growth along axes in which the output was limited.
 
         Args:
-            asked: The whole set-point that contains the last output, (n,).
-            applied: The same set-point after the limits, (n,).
+            asked: The complete set-point, which includes the last output, (n,).
+            applied: The same set-point after limiting, (n,).
         """
         wound_up = (applied - asked) * (self.integral - self._before) < 0.0
         self.integral = np.where(wound_up, self._before, self.integral)
 
     def reset(self) -> None:
-        """Restart with the integral at zero, because another client flew or the measurement is too old."""
+        """Restart with the integral at zero, because another client flew the vehicle or the measurement is too old."""
         self._before = self.integral = np.zeros_like(self.integral)

@@ -1,4 +1,4 @@
-"""Rehearsal of a controller in simulated time: with delay, loss and noise, and faster than real time."""
+"""Rehearsals of controllers in simulated time, with delay, loss and noise, and faster than real time."""
 
 from skyloop.stepping.rehearsal import Radio, rehearse
 

@@ -1,13 +1,14 @@
-"""A model of a vehicle's response to velocity set-points, to predict its motion and invert the response. Pure.
+"""A model of how a vehicle responds to velocity set-points, used to predict its motion and invert the response. Pure.
 
-The model of the vehicle's own loop: ``delay_s`` after a set-point was sent, the loop demands a lean in proportion to
-the velocity error, plus a trim that it learns. The lean follows within ``lag_s``, and together with the air's push it
-accelerates the vehicle. The lean is measured. A Kalman filter for velocity and push attributes the rest of the
-acceleration to the push; the trim is the lean that the velocity error does not explain. The model includes all
-set-points in transit, so a law can use the velocity that the vehicle will have when its set-point takes effect, with
-gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with Dead Time", Chemical
-Engineering Progress 53(5), 1957). It also cancels the push before it becomes an error (a disturbance observer: Ohnishi,
-Shibata and Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans. Mechatronics 1(1), 1996).
+The model of the vehicle's own velocity loop is this: ``delay_s`` after a set-point was sent, the loop demands a lean
+proportional to the velocity error, plus a trim. The lean follows with the lag ``lag_s`` and accelerates the vehicle, as
+does the push of the air. The lean is known from the attitude. A Kalman filter for velocity and push attributes the
+remaining acceleration to the push; the trim is the part of the lean that the velocity error does not explain. The model
+includes all set-points in transit, so a control law can use the velocity that the vehicle will have when its set-point
+takes effect, with gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with Dead
+Time", Chemical Engineering Progress 53(5), 1957). Such a law can also cancel the push before it causes an error (a
+disturbance observer: Ohnishi, Shibata and Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans.
+Mechatronics 1(1), 1996).
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
 
 _STEP_S = 0.01  # time step of the prediction
-_LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion during it is unknown
-_LONGEST_PREDICTION_S = 0.5  # maximum prediction beyond the last feedback
-_KEPT_SETPOINTS = 64  # number of newest set-points to keep
+_LONGEST_GAP_S = 0.25  # maximum gap in the feedback across which the model continues
+_LONGEST_PREDICTION_S = 0.5  # maximum time to predict beyond the last feedback
+_KEPT_SETPOINTS = 64  # number of recent set-points to keep
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop: by default the AR.Drone's, as far as public sources give it."""
+    """The response of a vehicle's velocity loop, by default that of the AR.Drone according to public sources."""
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
-    lag_s: float = 0.1  #: lag of the lean behind the demand; Engel, Sturm and Cremers, IROS 2012: 10 1/s
-    delay_s: float = 0.05  #: time from sending a set-point until the loop uses it
-    tilt_rad: float = 0.5  #: maximum lean that the loop demands; see also ``LandingSettings.within``
-    push_m_s3: float = 1.5  #: change of the air's push within a second [m/s² in √s]
+    lag_s: float = 0.1  #: time constant of the lean; Engel, Sturm and Cremers, IROS 2012, give a rate of 10 1/s
+    delay_s: float = 0.05  #: time from sending a set-point until it takes effect in the loop
+    tilt_rad: float = 0.5  #: maximum lean demanded by the loop; see also ``LandingSettings.within``
+    push_m_s3: float = 1.5  #: typical change of the push of the air in one second [m/s² per √s]
     velocity_noise_m_s: float = 0.05  #: noise of the velocity reported in feedback
     trim_s: float = 0.3  #: time constant for learning the trim
 
@@ -51,19 +52,19 @@ class ResponseSettings:
 
     @property
     def most_m_s2(self) -> float:
-        """Maximum horizontal acceleration from leaning."""
+        """Maximum horizontal acceleration that leaning can produce."""
         return GRAVITY_M_S2 * math.tan(self.tilt_rad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
+    """The predicted motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
 
     at_ns: int  #: time at which the set-point takes effect
     moved: Array  #: distance moved since the last feedback, (2,) [m]
     velocity: Array  #: velocity, (2,) [m/s]
     push: Array  #: acceleration caused by the air, (2,) [m/s²]
-    trim: Array  #: acceleration that the loop adds to what the velocity error demands, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop demands in addition to the velocity error's, (2,) [m/s²]
 
 
 class VelocityResponse:
@@ -72,18 +73,18 @@ class VelocityResponse:
     def __init__(self, settings: ResponseSettings | None = None) -> None:
         """Initialise the model."""
         self.settings = settings or ResponseSettings()
-        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: start, velocity
+        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: time of effect, velocity
         self._at_ns: int | None = None
         self._velocity = np.zeros(2)
         self._push = np.zeros(2)
         self._trim = np.zeros(2)
         self._lean = np.zeros(2)  # acceleration caused by the lean
-        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push per axis
+        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # covariance of velocity and push
 
     def add(self, feedback: Feedback) -> None:
-        """Update with the next sample; ignore it if it has no velocity or attitude or is not newer than the last one.
+        """Update with the next sample; ignore it if it lacks velocity or attitude or is not newer than the last one.
 
-        A sample older by more than half a second restarts the model, because the previous one was stamped ahead.
+        The model restarts if the sample is over half a second older than the last, whose time must have been wrong.
         """
         if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return
@@ -94,7 +95,7 @@ class VelocityResponse:
         lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * GRAVITY_M_S2)
         before_ns = self._at_ns
         if before_ns is not None and seconds(before_ns - feedback.captured_ns) > _LONGEST_PREDICTION_S:
-            before_ns = None  # the last sample was stamped ahead and would hide all samples until its time
+            before_ns = None  # the last sample's time was in the future and would hide all samples until then
             self._setpoints.clear()
         self._at_ns = max(feedback.captured_ns, before_ns or 0)
         if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:
@@ -105,7 +106,7 @@ class VelocityResponse:
             self._lean = lean
 
     def pause(self) -> None:
-        """Forget the set-points in transit, because another client flew the vehicle, and the trim learned from them."""
+        """Forget the set-points in transit and the trim learned from them, because another client flew the vehicle."""
         self._setpoints.clear()
         self._trim = np.zeros(2)
 
@@ -114,7 +115,7 @@ class VelocityResponse:
         self._setpoints.append((now_ns + nanoseconds(self.settings.delay_s), np.asarray(velocity, dtype=np.float64)))
 
     def predict(self, now_ns: int) -> Predicted | None:
-        """Predict the motion when a set-point sent now takes effect; None before the first feedback."""
+        """Predict the motion at the time when a set-point sent now takes effect; None before the first feedback."""
         if self._at_ns is None:
             return None
         end_ns = now_ns + nanoseconds(self.settings.delay_s)
@@ -130,13 +131,13 @@ class VelocityResponse:
         return Predicted(end_ns, moved, velocity, self._push, self._trim)
 
     def setpoint(self, acceleration: Array, motion: Predicted) -> Array:
-        """Return the velocity set-point (2,) [m/s] for an acceleration (2,) [m/s²], as far as leaning allows."""
+        """Return the velocity set-point (2,) [m/s] that causes an acceleration (2,) [m/s²], up to the maximum lean."""
         by_lean = shortened(acceleration - motion.push, self.settings.most_m_s2)
         return motion.velocity + (by_lean - motion.trim) / self.settings.gain_per_s
 
     def _asked(self, velocity: Array, at_ns: int) -> Array:
-        """Return the acceleration that the vehicle's loop demands from the lean."""
-        setpoint = velocity  # without a set-point the vehicle keeps its velocity
+        """Return the acceleration that the vehicle's loop demands by leaning."""
+        setpoint = velocity  # without a set-point, assume that the vehicle keeps its velocity
         for from_ns, asked in reversed(self._setpoints):
             if from_ns <= at_ns:
                 setpoint = asked

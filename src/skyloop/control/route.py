@@ -1,7 +1,7 @@
-"""Routes: waypoints with speeds, headings and actions, stored in ``NAME.route.json``, and checks before a flight.
+"""Routes, stored in ``NAME.route.json``, with a speed, heading and actions for each waypoint, and preflight checks.
 
-World axes are x east, y north, z up [m]; yaw is counter-clockwise from x [rad]. ``docs/routes.md`` describes the file.
-The checks cover legs, heights, speeds, battery and start.
+World axes are x east, y north, z up [m]; yaw is counter-clockwise from x [rad]. The file format is described in
+``docs/routes.md``. The checks cover legs, heights, speeds, battery and start.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Speed = Annotated[float, msgspec.Meta(ge=0.05, le=30.0)]
 Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Point = tuple[Metres, Metres]
-SETTLE_S: Final = 1.0  #: extra time per leg for accelerating and coming to rest
-LOOK_S: Final = 3.0  #: estimated duration of a look
+SETTLE_S: Final = 1.0  #: additional time per leg for accelerating and stopping
+LOOK_S: Final = 3.0  #: estimated duration of a look action
 PHOTO_S: Final = 1.0  #: estimated duration of a photo
-DESCENT_M_S: Final = 0.4  #: landing speed assumed by the estimate
-SLACK_M: Final = 0.15  #: tolerance, the same as the proxy's
+DESCENT_M_S: Final = 0.4  #: landing speed assumed for the estimate
+SLACK_M: Final = 0.15  #: tolerance of the checks, the same as in the proxy
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -62,7 +62,7 @@ class Look(_Part, frozen=True, tag_field="do", tag="look"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.yaw is None) == (self.at is None):
-            raise UsageError("look needs a yaw, or a point to look at: give one of yaw and at")
+            raise UsageError("look needs either a yaw or a point to look at: give one of yaw and at")
 
 
 class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
@@ -72,7 +72,7 @@ class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
 
 
 class Photo(_Part, frozen=True, tag_field="do", tag="photo"):
-    """Save a frame from a camera; None for the vehicle's first one."""
+    """Save a frame from a camera, by default from the vehicle's first one."""
 
     camera: Name | None = None
 
@@ -86,10 +86,10 @@ class RouteWaypoint(_Part, frozen=True):
     x: Metres  #: east [m]
     y: Metres  #: north [m]
     z: Metres  #: up [m]
-    speed: Speed | None = None  #: maximum speed on the way there [m/s]; None for the route's
-    yaw: Angle | None = None  #: yaw to turn to on the way there [rad]; None keeps the current yaw
-    look_at: Point | None = None  #: point (x, y) to face instead of a fixed yaw [m]
-    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform there, in this order
+    speed: Speed | None = None  #: maximum speed to this waypoint [m/s]; None for the route's speed
+    yaw: Angle | None = None  #: yaw to turn to before arrival [rad]; None keeps the current yaw
+    look_at: Point | None = None  #: point (x, y) [m] to face, as an alternative to a fixed yaw
+    actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform, in order
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,7 +107,7 @@ class RouteWaypoint(_Part, frozen=True):
         return Waypoint(self.x, self.y, self.z, self.yaw if self.look_at is None else self.yaw_to(self.look_at))
 
     def yaw_to(self, point: Point) -> float:
-        """Return the yaw that faces a point from this waypoint [rad]."""
+        """Return the yaw [rad] for facing a point from this waypoint."""
         return math.atan2(point[1] - self.y, point[0] - self.x)
 
 
@@ -121,9 +121,9 @@ class Route(_Part, frozen=True, kw_only=True):
     #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
     name: Name = ""  #: A human-readable name
-    speed: Speed = 0.5  #: maximum speed towards waypoints that don't have their own [m/s]
-    #: what to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of the
-    #: route at the last waypoint's height and lands
+    speed: Speed = 0.5  #: maximum speed to waypoints without their own [m/s]
+    #: what to do after the last waypoint: ``hover``, ``land`` or ``return``, which means to fly back to the start of
+    #: the route at the last waypoint's height and land there
     end: Literal["hover", "land", "return"] = "hover"
     version: Literal[1] = VERSION  #: version of the file format
 
@@ -133,7 +133,7 @@ class Route(_Part, frozen=True, kw_only=True):
             raise UsageError("a route needs at least one waypoint")
 
     def speed_to(self, index: int) -> float:
-        """Return the maximum speed on the way to a waypoint [m/s]; an index past the last one is for the way back."""
+        """Return the maximum speed to a waypoint [m/s]; an index past the last waypoint means the way back."""
         own = self.waypoints[index].speed if index < len(self.waypoints) else None
         return self.speed if own is None else own
 
@@ -144,7 +144,7 @@ class Route(_Part, frozen=True, kw_only=True):
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of a file; UsageError says where and why the content is not a route."""
+    """Read a route from the content of a file; if it is not a route, UsageError says where and why."""
     try:
         return checked(msgspec.json.decode(content, type=Route))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -175,7 +175,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route after checking the range of every number, of routes built by a program only here."""
+    """Return the route after checking that all numbers are in range, also in routes built by a program."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -187,34 +187,34 @@ class Conditions:
     """The conditions against which a route is checked."""
 
     space: Space = field(default_factory=Space)  #: where flying is allowed
-    #: start of the route [m]: the vehicle's position, or above it before take-off; None if unknown
+    #: start of the route [m]: the vehicle's position or, before take-off, a point above it; None if unknown
     start: Vector | None = None
     problem: str = ""  #: why the vehicle can't be flown by position; empty if it can
     ground_m: float | None = None  #: height of the ground in world axes; None if unknown
-    battery: float | None = None  #: current charge, 0 to 1; None if unknown
+    battery: float | None = None  #: current battery charge, 0 to 1; None if unknown
     speed_m_s: float = 2.0  #: maximum horizontal speed
     climb_m_s: float = 1.0  #: maximum speed up or down
     altitude_m: float = 5.0  #: maximum height above the ground
-    battery_warn: float = 0.2  #: charge below which the vehicle warns
-    battery_land: float = 0.1  #: charge below which the vehicle lands
+    battery_warn: float = 0.2  #: battery charge below which the vehicle warns
+    battery_land: float = 0.1  #: battery charge below which the vehicle lands
     flight_time_s: float = 600.0  #: flight time with a full battery
 
 
 class Finding(msgspec.Struct, frozen=True):
     """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: from 1, or None for the whole route; for a leg, the waypoint at its end
+    waypoint: int | None  #: number from 1 (for a leg, of its end point), or None for the whole route
     severity: Literal["error", "warning"]
     reason: str
 
 
 class RouteCheck(msgspec.Struct, frozen=True):
-    """The findings, and an estimate of the flight."""
+    """Findings about a route, with estimates for the flight."""
 
     findings: tuple[Finding, ...]
     length_m: float
     seconds: float
-    battery_left: float | None  #: charge at the end, 0 to 1; None if the current charge is unknown
+    battery_left: float | None  #: battery charge at the end, 0 to 1; None if the current charge is unknown
 
     @property
     def ok(self) -> bool:
@@ -258,12 +258,12 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
-    """Check a route against a drone's newest feedback and parameters. Waits for the proxy's answer.
+    """Check a route against a drone's newest feedback and parameters; waits for the proxy's answer.
 
-    An observer's connection is enough. A position, for example after connecting, is awaited for ``wait_s``.
+    An observer's connection is enough. The check waits up to ``wait_s`` for the first position.
     """
     feedback = None
-    with suppress(LinkError):  # having no feedback yet becomes a finding
+    with suppress(LinkError):  # missing feedback becomes a finding
         if wait_s > 0.0:
             with suppress(NoAnswerError):
                 drone.wait(lambda newest: newest.position_m is not None, wait_s)
@@ -275,8 +275,8 @@ def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
 def check_route(route: Route, conditions: Conditions) -> RouteCheck:
     """Check each waypoint, each leg and the route as a whole.
 
-    The estimate adds up the time of each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the
-    duration of the actions. The battery falls in proportion to this time, as given by ``flight_time_s``.
+    The estimated duration is the sum of the time for each leg at its speed, :data:`SETTLE_S` per leg for starting and
+    stopping, and the duration of all actions. The battery is assumed to drain evenly over ``flight_time_s``.
     """
     found: list[Finding] = []
 
@@ -321,14 +321,14 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
         warning(None, "the battery's charge is unknown: can't check whether it lasts")
     elif left < c.battery_land:
         minutes = f"{seconds / 60:.1f} minutes of the {c.flight_time_s / 60:g} of a full battery (battery.flight_time)"
-        error(None, f"the battery ends below {c.battery_land:.0%}, where the vehicle lands: the route takes {minutes}")
+        error(None, f"the battery falls below {c.battery_land:.0%} and the vehicle lands: the route takes {minutes}")
     elif left < c.battery_warn:
-        warning(None, f"the battery ends at about {left:.0%}, below {c.battery_warn:.0%} (battery.warn)")
+        warning(None, f"the battery ends up at about {left:.0%}, below {c.battery_warn:.0%} (battery.warn)")
     return RouteCheck(tuple(found), length_m, seconds, None if left is None else max(0.0, left))
 
 
 def _height_problem(place: Vector, c: Conditions) -> str:
-    """Return the problem with the height of a point; empty if there is none."""
+    """Return a description of the problem with a point's height; empty if there is none."""
     ground = c.ground_m
     if ground is None:
         return ""

@@ -1,7 +1,7 @@
-"""Route flights: the law that decides their course, the controller for programs, and the photos taken on a route.
+"""Route flights: the control law, the controller for programs, and the photos taken along a route.
 
-Programs, the command line and the cockpit's page all use this law to fly routes. It is pure: times are arguments, and
-it decides on the next step from the newest feedback.
+Programs, the command line and the cockpit's page all use this law to fly routes. The law is pure: it takes times as
+arguments and decides on the next step from the newest feedback.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 
 TURN_S: Final = 15.0  #: maximum time for a turn
 PHOTO_S: Final = 5.0  #: maximum time for a photo
-SLOWEST: Final = 3.0  #: maximum duration of a leg, as a multiple of that at full speed
-EXTRA_S: Final = 20.0  #: time added to this maximum; after both, the route pauses
-_NEAR_RAD: Final = 0.12  # maximum yaw error at which a look is complete
+SLOWEST: Final = 3.0  #: maximum duration of a leg as a multiple of its duration at full speed
+EXTRA_S: Final = 20.0  #: time added to this maximum; when both have passed, the route pauses
+_NEAR_RAD: Final = 0.12  # maximum yaw error for a look action to be complete
 ENDED: Final = "a failsafe took over: this program sent nothing for a while, or a link was lost"
 TAKEN: Final = "another command of this program replaced it"
-PHOTOS: Final = "photos"  #: default folder of photos
+PHOTOS: Final = "photos"  #: default folder for photos
 LOG: Final = "route"  #: log name of the progress
 WAYPOINTS: Final = "waypoints"  #: log name of the remaining waypoints, for maps
 _QUALITY: Final = 92  # JPEG quality
-_LOG_S: Final = 4.0  #: interval of logging: maps drop positions logged more than 10 s ago
+_LOG_S: Final = 4.0  #: logging interval: maps drop positions logged more than 10 s ago
 
 
 class RouteState(StrEnum):
@@ -64,7 +64,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class TakePhoto:
-    """Save a frame captured after this request, then call :meth:`RouteLaw.photo_done`."""
+    """Save a frame that was captured after this request, then call :meth:`RouteLaw.photo_done`."""
 
     waypoint: int  #: number of the waypoint, from 1
     camera: str | None
@@ -83,17 +83,17 @@ Effect = Command | TakePhoto | Progress
 
 
 class RouteLaw:
-    """The course of one flight along a route. Its methods return the effects to carry out now, in order."""
+    """The control law for one flight along a route. Its methods return the effects to carry out now, in order."""
 
     def __init__(self, route: Route) -> None:
         self.route = route
         self.state = RouteState.READY  #: state of the flight
         self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the way back
-        self.problem = ""  #: why the law paused without being asked to; empty otherwise
+        self.problem = ""  #: why the law paused without a request; empty otherwise
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
         self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun
-        self._skipped_all = False  # whether, while paused, only the end of the route remains
+        self._skipped_all = False  # whether all waypoints were skipped while paused
         self._since_ns: int | None = None  # start of the current action
         self._deadline_ns: int | None = None
         self._photo: str | None = None  # result of the photo: empty if saved, None while pending
@@ -105,7 +105,7 @@ class RouteLaw:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the law is commanding the vehicle now."""
+        """Whether the law is currently commanding the vehicle."""
         return self.state in (RouteState.FLYING, RouteState.ACTING)
 
     @property
@@ -116,7 +116,7 @@ class RouteLaw:
     # Requests ---------------------------------------------------------------------------------------------------
 
     def start(self, feedback: Feedback) -> list[Effect]:
-        """Begin at the first waypoint; UsageError if the vehicle is on the ground or its position is unknown."""
+        """Fly to the first waypoint; raise UsageError if the vehicle is on the ground or its position is unknown."""
         problem = lacking(feedback)
         if problem or feedback.position_m is None:
             raise UsageError(f"the route can't be flown: {problem}")
@@ -128,14 +128,14 @@ class RouteLaw:
         return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
 
     def pause(self, why: str = "") -> list[Effect]:
-        """Hover until :meth:`resume`; ``why`` is the reason for a pause that was not requested."""
+        """Hover until :meth:`resume` is called; ``why`` is the reason for a pause that was not requested."""
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
         return [Command(Hover()), self._tell("paused", why or "as asked")]
 
     def resume(self) -> list[Effect]:
-        """Continue straight to the next waypoint, or to the route's end if all waypoints were skipped."""
+        """Continue straight to the next waypoint, or to the end of the route if all waypoints were skipped."""
         if self.state is not RouteState.PAUSED:
             return []
         if self._skipped_all:
@@ -143,7 +143,7 @@ class RouteLaw:
         return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
 
     def skip(self) -> list[Effect]:
-        """Skip the current waypoint. A paused route stays paused, even if no waypoint remains."""
+        """Skip the current waypoint; a paused route stays paused, even if no waypoint is left."""
         if self.over or self.state is RouteState.READY or self._skipped_all:
             return []
         skipped = self._tell("skipped", self._what())
@@ -164,14 +164,14 @@ class RouteLaw:
     # The vehicle's progress ---------------------------------------------------------------------------------------
 
     def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Take the next step according to the newest feedback; ``now_ns`` is on the clock of its capture time."""
+        """Take the next step based on the newest feedback; ``now_ns`` is on the same clock as its capture time."""
         if not self.is_under_way:
             return []
         if not feedback.state.airborne:
             self.state, self.problem = RouteState.STOPPED, f"the vehicle is {feedback.state.value}"
             return [self._tell("stopped", self.problem)]
         if lacking(feedback):
-            return []  # meanwhile the proxy makes the vehicle hover
+            return []  # until then, the proxy makes the vehicle hover
         if self.state is RouteState.FLYING:
             return self._on_the_way(feedback, now_ns)
         return self._act(feedback, now_ns)
@@ -221,7 +221,7 @@ class RouteLaw:
         return []
 
     def _done(self, action: Action, feedback: Feedback, for_s: float) -> tuple[bool, str]:
-        """Return whether an action is done, and the problem if there was one."""
+        """Return whether an action is done, and a description of the problem if it failed."""
         if isinstance(action, Wait):
             return for_s >= action.seconds, ""
         if isinstance(action, Look):
@@ -266,14 +266,14 @@ def _name(action: Action) -> str:
 class FlyRoute(Controller):
     """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the route's end.
 
-    The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
-    ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg,
-    or a failsafe or another command from this program ends it, the route pauses, with the reason, until :meth:`resume`.
-    :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` can be called from any thread; they take effect with the
-    next feedback.
+    The vehicle must be airborne when :meth:`run` is called. Each step is published as an event of kind
+    ``vehicle_message`` with ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. If
+    the proxy refuses a leg, or a failsafe or another command from this program ends it, the route pauses, giving the
+    reason, until :meth:`resume` is called. :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` can be called
+    from any thread and take effect with the next feedback.
 
     Attributes:
-        law: The course of the flight: its state, waypoint and problem.
+        law: The control law, with the flight's state, waypoint and problem.
         photos: Paths of the saved photos.
     """
 
@@ -290,8 +290,8 @@ class FlyRoute(Controller):
         Args:
             drone: The drone to fly.
             route: The route; use :meth:`check` before flying it.
-            folder: Folder for photos; created when needed.
-            on_progress: Function that is called with each step, on the thread that runs the controller.
+            folder: Folder for photos, which is created when needed.
+            on_progress: A function called with each step, on the thread that runs the controller.
         """
         super().__init__(drone)
         self.law = RouteLaw(route)
@@ -307,7 +307,7 @@ class FlyRoute(Controller):
         return check_for(self.drone, self.law.route)
 
     def pause(self) -> None:
-        """Hover until :meth:`resume`."""
+        """Hover until :meth:`resume` is called."""
         self._asked.append(self.law.pause)
 
     def resume(self) -> None:
@@ -326,7 +326,7 @@ class FlyRoute(Controller):
         """Take the next step.
 
         Raises:
-            UsageError: At the start, the vehicle does not report its position or is on the ground.
+            UsageError: The vehicle is on the ground or does not report its position at the start.
         """
         law = self.law
         if law.state is RouteState.READY:
@@ -335,7 +335,7 @@ class FlyRoute(Controller):
             self._carry_out(self._asked.pop(0)())
         if refused := self._why_ended():
             effects = law.pause(refused)
-            if refused == TAKEN:  # the other command continues, so don't hover
+            if refused == TAKEN:  # the other command is still in force, so don't hover
                 effects = [each for each in effects if not isinstance(each, Command)]
             self._carry_out(effects)
         self._carry_out(law.update(feedback, feedback.captured_ns))
@@ -351,7 +351,7 @@ class FlyRoute(Controller):
                 self._leg = None
                 if isinstance(effect.action, Position):
                     self._leg = ask(self.drone, effect.action)
-                else:  # the route, not a person, made it hover or land
+                else:  # the route, not a person, requested the hover or landing
                     let_go(self.drone, f"the route is {self.law.state.value}", land=isinstance(effect.action, Land))
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
@@ -377,7 +377,7 @@ class FlyRoute(Controller):
             self._on_progress(step)
 
     def _why_ended(self) -> str:
-        """Return why the current leg ended early, once; empty while it is being flown."""
+        """Return why the current leg ended early, reporting it only once; empty while the leg is being flown."""
         flown = commands(self.drone)
         outcome = None if self._leg is None else flown.outcome(self._leg)
         if outcome is None or not outcome.failed or not flown.may_ask:
@@ -389,7 +389,7 @@ class FlyRoute(Controller):
 
 
 def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
-    """Wait for the next frame and save it as a JPEG named by time, waypoint and camera.
+    """Wait for the next frame and save it as a JPEG file named after time, waypoint and camera.
 
     Raises:
         SkyloopError: No frame arrived in time, the vehicle has no such camera, or the file can't be written.
@@ -409,7 +409,7 @@ def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} can't be created: {error.strerror or error}") from None
-    while path.exists():  # the same time can recur, for example after the clock was set back
+    while path.exists():  # times can recur, for example after the clock was set back
         number += 1
         path = folder / f"{moment}-{number}-{name}"
     write(path, jpeg.tobytes())

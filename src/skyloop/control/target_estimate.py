@@ -1,16 +1,16 @@
-"""Estimation of a target's position, motion and size from its box in images. Pure: times are on the proxy's clock.
+"""Estimation of a target's position, motion and size from its box in images; pure, with times on the proxy's clock.
 
 The estimate is an extended Kalman filter (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and
 Navigation", Wiley 2001, section 10.3) of the position of the target's foot, its horizontal velocity, the foot's height
-and the logarithm of the target's height. Each box gives an azimuth and the slopes to its lower and upper edge. The
-range comes, with an uncertainty, from all available cues: the known size of a class or target; the ground below the
-target, if the vehicle knows its own height; and the vehicle's motion, because close things grow faster. Without any
-cue, the initial range is a nominal one and all ranges scale with it: the law then keeps the apparent size, as in
-image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object tracking and
-following for unmanned aerial vehicles", SSRR 2013).
+and the logarithm of the target's height. Each box provides an azimuth and the slopes to its lower and upper edges. The
+range and its uncertainty are derived from all available cues: the known size of a class or target, the ground below the
+target (if the vehicle knows its own height) and the vehicle's motion, because close objects grow faster. If there is no
+cue, a nominal initial range is assumed. All ranges then scale with it, and the control law keeps the apparent size
+constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object
+tracking and following for unmanned aerial vehicles", SSRR 2013).
 
-Directions are in *odometry axes* (see :mod:`.airframe`). They are levelled by the attitude at the time of capture, so
-the vehicle's roll and pitch don't move an object. For an edge cut off by the image, only a bound is known.
+Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level them, so
+that the vehicle's roll and pitch don't move an object. For an edge outside the image, only a bound is known.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from skyloop.poses import mounting_rotation
 from skyloop.vision.lens import project, unproject
 from skyloop.vision.tracking import Box
 
-_CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off ...
+_CUT_PX: Final = 2.0  # distance to the image's edge within which a box may be cut off [px] ...
 _CUT: Final = 0.07
-_BESIDE: Final = 0.75  # distance from the optical axis in image sizes; 0.5 is the edge
-_STEEPEST: Final = 0.15  # minimum cosine of the elevation; an object almost straight above or below has no azimuth
-_TILT_RAD: Final = 0.008  # error of the attitude at the time of capture, which moves both edges equally
+_BESIDE: Final = 0.75  # maximum distance from the optical axis as a fraction of the image size; 0.5 is the edge
+_STEEPEST: Final = 0.15  # minimum cosine of the elevation: objects almost straight above or below have no azimuth
+_TILT_RAD: Final = 0.008  # error of roll and pitch at the time of capture, which shifts both edges equally
 _YAW_RAD: Final = 0.006  # error of the yaw at the time of capture
-_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, from encoding, network and decoding
+_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, due to encoding, network and decoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Camera:
     size: tuple[int, int]  #: width and height of the image [px]
     yaw_rad: float = _YAW_RAD  #: standard deviation of the yaw at the time of capture
     tilt_rad: float = _TILT_RAD  #: standard deviation of the tilt
-    #: climb by the vehicle's integrated velocity, regardless of the ground [m]; None if unknown
+    #: climb integrated from the vehicle's velocity, regardless of the ground [m]; None if unknown
     rise_m: float | None = None
 
     @classmethod
@@ -67,9 +67,9 @@ class Camera:
     ) -> Camera | None:
         """Determine a camera's pose; None if the attitude is unknown.
 
-        The body's position is (3,) [m], the third value its height above the ground, if known. Where images and
-        attitude have no common clock, the rates of yaw and tilt tell how uncertain the attitude at the time of capture
-        is. ``risen_m`` is the climb by the vehicle's integrated velocity; None if unknown.
+        ``body`` is the vehicle's position, (3,) [m]; its third value is the height above the ground, if known. If
+        images and attitude have no common clock, the rates of yaw and tilt determine the attitude's uncertainty at
+        capture. ``risen_m`` is the climb integrated from the vehicle's velocity; None if unknown.
         """
         if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
             return None
@@ -82,9 +82,9 @@ class Camera:
         return cls(body + aside, rotation, intrinsics, size, yaw_rad, tilt_rad, rise_m)
 
     def pixel(self, point: Array) -> tuple[float, float] | None:
-        """Return the pixel of a point (3,) in the image or slightly outside it [px]; None if it is further out.
+        """Return the image coordinates [px] of a point (3,) in or slightly outside the image; None if further out.
 
-        A lens model is valid only within the image: far outside, the distortion's polynomial folds back into it.
+        A lens model is only valid within the image: far outside, the distortion polynomial folds points back into it.
         """
         ray = self.rotation.T @ (point - self.position)
         lens, (columns, rows) = self.intrinsics, self.size
@@ -95,32 +95,32 @@ class Camera:
         return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
     def shows(self, point: Array) -> bool:
-        """Return whether a point (3,) is within the image, provided that nothing hides it."""
+        """Return whether a point (3,) lies within the image; it may still be hidden by something."""
         pixel = self.pixel(point)
         return pixel is not None and 0.0 <= pixel[0] < self.size[0] and 0.0 <= pixel[1] < self.size[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxView:
-    """The directions of a box's middle and edges."""
+    """The directions of the centre and edges of a box."""
 
-    azimuth: float  #: azimuth of the middle, counter-clockwise from x of odometry axes [rad]
-    bottom: float | None  #: tangent of the lower edge's elevation; None if the image cuts it off
-    top: float | None  #: tangent of the upper edge's elevation; None if the image cuts it off
+    azimuth: float  #: azimuth of the centre, counter-clockwise from the odometry's x axis [rad]
+    bottom: float | None  #: tangent of the lower edge's elevation; None if outside the image
+    top: float | None  #: tangent of the upper edge's elevation; None if outside the image
     azimuth_rad: float  #: standard deviation of the azimuth
-    edge: float  #: standard deviation of each edge, independent of the other
-    #: if the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None
+    edge: float  #: standard deviation of each edge's slope, independent of the other edge
+    #: upper bound for the tangent of the lower edge's elevation if the edge is outside the image; otherwise None
     below: float | None = None
-    #: if the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None
+    #: lower bound for the tangent of the upper edge's elevation if the edge is outside the image; otherwise None
     above: float | None = None
     tilt: float = _TILT_RAD  #: standard deviation common to both edges
 
     @classmethod
     def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
-        """Compute the directions of a box (x, y, width, height [px]); None if it is almost straight up or down.
+        """Compute the directions for a box (x, y, width, height [px]); None if it is almost straight above or below.
 
-        ``noise`` is the standard deviation of an edge as a fraction of the box's height; one pixel is added. None also
-        for a box that this camera can't show.
+        ``noise`` is the standard deviation of an edge as a fraction of the box's height; one pixel is added. The result
+        is also None for boxes that this camera can't see.
         """
         x, y, width, height = box
         columns, rows = camera.size
@@ -136,7 +136,7 @@ class BoxView:
         across = (1.0 + noise * width) / focal
         near = max(_CUT_PX, _CUT * height)
         if x < near or x + width > columns - near:
-            across += 0.3 * width / focal  # the middle of the visible part is not the object's middle
+            across += 0.3 * width / focal  # the centre of the visible part is not the object's centre
         cut_below, cut_above = y + height > rows - near, y < near
         return cls(
             azimuth=math.atan2(rays[2, 1], rays[2, 0]),
@@ -151,7 +151,7 @@ class BoxView:
 
 
 def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
-    """Return the approximate box [px] of an upright object, so much wider than high; None if not all is in view."""
+    """Return an upright object's approximate box [px], given its aspect ratio; None if it is not fully in view."""
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:
         return None
@@ -161,21 +161,21 @@ def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0
 
 
 _NEAREST_M: Final = 0.3  # minimum range
-_RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning: gusts, and a wrong drag constant
+_RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning, from gusts and an inaccurate drag constant
 _LATE_S: Final = 0.5  # maximum age of a useful box
 _ADAPTING: Final = 0.3  # weight of a single box in the average surprise
 _USUAL: Final = 1.5  # maximum surprise that counts as noise
-_MOST_SURPRISE: Final = 4.0  # limit of a single box in the average
-_STRAIGHT_S: Final = 4.0  # maximum time to predict an unseen target's straight motion
-_GONE_S: Final = 0.2  # minimum time unseen after which a target counts as hidden ...
-_GONE_INTERVALS: Final = 2.5  # ... and the minimum number of intervals between boxes
-_BEFORE_S: Final = 0.2  # time before the last sighting when the occluder had not begun to cut off the box
-_GATE: Final = 4.0  # standard deviations of the azimuth
-_EDGE_GATE: Final = 3.0  # standard deviations of an edge, beyond which it is hidden or not the target's
-_OUTGROWN: Final = 3.0  # standard deviations by which both edges are too far out
-_PACE_PER_S: Final = 0.2  # velocity deviation per metre of the guessed range
+_MOST_SURPRISE: Final = 4.0  # maximum contribution of a single box to the average surprise
+_STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move straight on
+_GONE_S: Final = 0.2  # minimum time out of view before a target counts as hidden ...
+_GONE_INTERVALS: Final = 2.5  # ... and the minimum time in intervals between boxes
+_BEFORE_S: Final = 0.2  # time before a loss at which boxes are assumed to be unoccluded
+_GATE: Final = 4.0  # maximum azimuth error in standard deviations
+_EDGE_GATE: Final = 3.0  # maximum edge error in standard deviations; beyond it, the edge is hidden or not the target's
+_OUTGROWN: Final = 3.0  # error of both edges, in standard deviations, above which a box is too large
+_PACE_PER_S: Final = 0.2  # standard deviation of the velocity per metre of the guessed range
 LEAST_SLOPE: Final = 0.04  # minimum slope at which an edge's height reveals the range
-SURE_OF_SIZE: Final = 0.4  # deviation of the log height from which the size counts as unknown
+SURE_OF_SIZE: Final = 0.4  # standard deviation of the log height at which the size counts as unknown
 
 
 def _is_number(value: object) -> bool:
@@ -188,11 +188,11 @@ class Traits:
 
     height_m: float | None = None
     height_share: float = 0.1  #: standard deviation of the height, as a fraction of the height
-    radius_m: float = 0.0  #: distance from the target's middle to its visible lower edge
-    #: intensity of the random acceleration; its root is the change of the velocity within a second
+    radius_m: float = 0.0  #: distance from the target's centre to its visible lower edge
+    #: intensity of the random acceleration; its square root is the typical velocity change in one second
     intensity_m2_s3: float = 1.0
-    #: Whether the target is on the ground. None assumes so for a target with a class; for others it is one hypothesis
-    #: among several (:mod:`.target_range`).
+    #: Whether the target is on the ground. If None, this is assumed for targets with a class; for others it is one of
+    #: several hypotheses (:mod:`.target_range`).
     on_ground: bool | None = None
 
     def __post_init__(self) -> None:
@@ -214,7 +214,7 @@ TRAITS: Final = {
     "dog": Traits(height_m=0.55, height_share=0.4, radius_m=0.2, intensity_m2_s3=2.0),
     "box": Traits(radius_m=0.3, intensity_m2_s3=0.05),
 }
-UNKNOWN: Final = Traits(radius_m=0.1)  #: a target without a class
+UNKNOWN: Final = Traits(radius_m=0.1)  #: traits of targets without a class
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,18 +222,18 @@ class TargetState:
     """The state of a target at a point in time."""
 
     at_ns: int  #: time of the state on the proxy's clock
-    foot: Array  #: position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground
+    foot: Array  #: position of the target's foot in odometry axes, (3,) [m], with z above the ground
     velocity: Array  #: horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own
     height_m: float
     place_m: float  #: standard deviation of the position: the root of the sum of the horizontal variances
     range_m: float  #: horizontal distance from the camera that last saw the target
-    range_deviation_m: float  #: standard deviation along the line of sight
-    range_known: bool = True  #: whether the range is good enough to fly by; False if it is only a guess
-    margin_m: float = 0.0  #: extra distance to keep because the target may be closer; 0 for a target on the ground
+    range_deviation_m: float  #: standard deviation of the range
+    range_known: bool = True  #: whether the range is good enough for flying; False if it is only a guess
+    margin_m: float = 0.0  #: extra clearance because the target may be closer; 0 for targets on the ground
 
     @property
     def middle(self) -> Array:
-        """The target's middle, (3,) [m]."""
+        """The target's centre, (3,) [m]."""
         return np.add(self.foot, (0.0, 0.0, self.height_m / 2))
 
 
@@ -247,10 +247,10 @@ class TargetEstimator:
     """The filter for one target."""
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
-        """Initialise the filter; ``nominal_m`` is the initial distance if there is no cue.
+        """Initialise the filter; ``nominal_m`` is the initial range if there is no cue.
 
-        If ``relative``, the vehicle's own velocity comes from dead reckoning, whose changing error adds to the target's
-        motion.
+        With ``relative``, the vehicle's own velocity comes from dead reckoning, and its changing error adds to the
+        target's motion.
         """
         self.traits = traits  #: prior knowledge about the target
         self.refused = 0  #: number of consecutive boxes that did not fit
@@ -258,18 +258,18 @@ class TargetEstimator:
         self._nominal_m, self._relative = nominal_m, relative
         self._intensity = traits.intensity_m2_s3 + (_RECKONING_M2_S3 if relative else 0.0)
         self._at_ns = 0
-        self._state = np.zeros(6)  # x, y, velocities, foot's height, log of the height
+        self._state = np.zeros(6)  # x, y, their velocities, height of the foot, log of the target's height
         self._covariance = np.eye(6)
-        self._surprise = 1.0  # recent mean of the squared Mahalanobis distance of azimuth and size, about 1
+        self._surprise = 1.0  # recent mean of the squared Mahalanobis distance of boxes, normally about 1
         self._eye: Array = np.zeros(3)  # position of the camera that last saw the target
-        self._before: deque[_Estimate] = deque()  # estimates from earlier boxes, back to _BEFORE_S
+        self._before: deque[_Estimate] = deque()  # estimates from earlier boxes, up to _BEFORE_S old
         self._interval_s = 0.0  # time between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
-        """Start from a first box; ``ground`` tells whether the camera's height above the ground is known."""
+        """Start from a first box; ``ground`` states whether the camera's height above the ground is known."""
         traits, height = self.traits, float(camera.position[2])
         ground = ground and traits.on_ground is not False
-        guesses = [(self._nominal_m, 0.5)]  # range, relative deviation
+        guesses = [(self._nominal_m, 0.5)]  # range and its relative deviation
         if ground and view.bottom is not None and view.bottom < -LEAST_SLOPE:
             share = math.hypot(view.edge / -view.bottom, 0.05 / max(0.1, height)) + view.tilt / -view.bottom
             guesses.append((height / -view.bottom + traits.radius_m, share))
@@ -301,15 +301,15 @@ class TargetEstimator:
         covariance[2:4, 2:4] = np.eye(2) * (1.0 if self._intensity < 3.0 else 4.0)
         covariance[4, 4] = 0.05**2 if ground else (0.1 * distance) ** 2
         covariance[5, 5] = log_deviation**2
-        if not known:  # a target further away than assumed is also larger
+        if not known:  # if the target is further away than assumed, it is also larger
             covariance[:2, 5] = covariance[5, :2] = radial / distance * along
             covariance[5, 5] += share**2
         self._begin(self._state, covariance, camera, at_ns)
 
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
-        """Start from a first box at a guessed range, with the size that explains the box.
+        """Start from a first box at a guessed range, with the target size that explains the box.
 
-        ``share`` is the range's standard deviation as a fraction of it. Foot and height scale with the range.
+        ``share`` is the relative standard deviation of the range. Foot position and height scale with the range.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -327,9 +327,9 @@ class TargetEstimator:
         self.loosen(distance_m)
 
     def loosen(self, distance_m: float) -> None:
-        """Assume, right after the start, that the target's speed is in proportion to its range.
+        """Assume that the target's speed is proportional to its range; call this right after the start.
 
-        Without this, boxes that hardly move would favour the farthest of several guesses.
+        Without this, boxes that hardly move would favour the most distant of several guesses.
         """
         pace = _PACE_PER_S * distance_m
         self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
@@ -346,10 +346,9 @@ class TargetEstimator:
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Measure how badly a box fits.
 
-        Return the squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own
-        boxes, and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are
-        infinite for a box that is too large above and below, because occlusion hides parts of a target but never adds
-        any.
+        Return the squared Mahalanobis distance divided by the number of measurements (about 1 for the target's own
+        boxes), and the box's doubled negative log-likelihood, up to a constant shared by all filters. Both are infinite
+        if the box extends too far both upwards and downwards, because occlusion can only make boxes smaller.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
@@ -361,9 +360,9 @@ class TargetEstimator:
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box; return whether it was used. One over half a second older than the newest is not.
+        """Update with a box and return whether it was used; boxes over half a second older than the newest are not.
 
-        An edge far from its expected position is ignored as hidden. A box in a different direction is refused.
+        Edges far from where they are expected count as hidden and are ignored. Boxes in other directions are refused.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -391,9 +390,9 @@ class TargetEstimator:
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state. It moves for at most four seconds, while the uncertainty keeps growing.
+        """Predict the target's state; motion continues for at most four seconds, but the uncertainty keeps growing.
 
-        A hidden target keeps its motion from shortly before, because the occluder cuts off its last boxes.
+        For a hidden target, the motion shortly before the loss is used, because the occluder cut off its last boxes.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -413,14 +412,14 @@ class TargetEstimator:
         )
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a filter, not started yet, for the same target when it comes back into view."""
+        """Return a new filter, not started yet, for the same target once it comes back into view."""
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
-        """Return the state and covariance at a time.
+        """Return the predicted state and covariance for a time.
 
-        For a time shortly before the newest box (detections from other processes arrive late), the state is moved back
-        and the covariance is unchanged.
+        For times shortly before the newest box (detections from other processes arrive late), the state is moved back
+        and the covariance stays the same.
         """
         dt = seconds(at_ns - self._at_ns)
         if dt <= 0.0:
@@ -431,7 +430,7 @@ class TargetEstimator:
         else:
             from_state, from_covariance = self._state, self._covariance
         move, wander = np.eye(6), np.zeros((6, 6))
-        # A turning target keeps surprising the filter, so raise its assumed acceleration.
+        # The boxes of a turning target keep deviating from the prediction, so assume a higher acceleration.
         harder = max(1.0, self._surprise / _USUAL) ** 2
         move[:4, :4], wander[:4, :4] = drift(dt, self._intensity * harder, axes=2)
         wander[4, 4] = 0.02**2 * dt
@@ -452,7 +451,7 @@ def _moved(state: Array, dt_s: float) -> Array:
 
 
 def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) -> tuple[Array, Array, Array]:
-    """Return measured minus expected values, azimuth first, their derivative by the state, and the noise covariance."""
+    """Return measured minus expected values (azimuth first), their Jacobian for the state, and the noise covariance."""
     eye = camera.position
     dx, dy = float(state[0] - eye[0]), float(state[1] - eye[1])
     distance = max(_NEAREST_M, math.hypot(dx, dy))
@@ -469,7 +468,7 @@ def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) ->
     ):
         expected = (level - float(eye[2])) / away
         if slope is None and bound is not None and side * (expected - bound) < 0.0:
-            slope = bound  # otherwise the edge would be visible, so the target is at least this close
+            slope = bound  # if further away, the edge would be visible: the target is at least this close
         if slope is None:
             continue
         rows.append(slope - expected)

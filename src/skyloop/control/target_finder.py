@@ -1,9 +1,10 @@
-"""Find a target in a series of images by a box tracker and, if there is a detector, by detections.
+"""Find a target in a series of images by means of a box tracker and, if there is a detector, its detections.
 
-It has no drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows
-the target's appearance, and the scene (:mod:`.target_scene`) knows where everything is and how it moves. Each finds the
-target where the other fails, and neither may mistake another object for it: the tracker's box must be where the target
-can be, and an object that appears after a loss must be where the target can be, look like it, and be the only one to.
+The finder uses no drone, thread or clock; call it from one thread only. The tracker
+(:class:`skyloop.vision.LongTermTracker`) knows the target's appearance, and the scene (:mod:`.target_scene`) knows
+where all objects are and how they move. Each can find the target when the other fails. To avoid confusion, the
+tracker's box must be where the target can be. After a loss, a new object must also be there and be the only one that
+looks like the target.
 """
 
 from __future__ import annotations
@@ -24,29 +25,29 @@ from skyloop.vision.appearance import colours
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, overlap_area
 
-_SAME: Final = 0.4  # overlap from which two boxes show the same object
-_POINTED_AT: Final = 0.3  # overlap between the user's box and the detection that it selects
-_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges, a fraction of the box height; a detector's are sharper
-_BESIDE_LATE: Final = 0.25  # the same while late detections give the size, on which the tracker drifts
-_TAKEN: Final = 0.5  # fraction of the tracker's box that is inside another object's detection
+_SAME: Final = 0.4  # minimum overlap of two boxes that show the same object
+_POINTED_AT: Final = 0.3  # minimum overlap between the user's box and the detection that it selects
+_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are sharper
+_BESIDE_LATE: Final = 0.25  # the same when late detections provide the size, because the tracker's size drifts
+_TAKEN: Final = 0.5  # fraction of the tracker's box inside another object's box at which it shows that object
 _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
-_DOUBT: Final = 6  # number of consecutive images with the tracker's box where the target can't be
-_LATELY_S: Final = 1.0  # time to keep clear of others after they were last seen
-_DORMANT_S: Final = 1.0  # time out of sight after which the target must be recognised again
-_SIMILAR: Final = 1.6  # maximum mean colour unlikeness of a newcomer that may be the target
+_DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
+_LATELY_S: Final = 1.0  # time to keep clear of other objects after they were last seen
+_DORMANT_S: Final = 1.0  # time out of view after which the target must be recognised again
+_SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be it
 _LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
-_LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to know its motion
+_LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to determine the newcomer's motion
 _LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
-_OF_LATE: Final = 8  # number of images that dominate the mean
-_TWIN: Final = 0.6  # unlikeness up to which only place and motion tell another object from the target
-_TWIN_S: Final = 60.0  # time after the last sighting of a twin during which a newcomer may be the twin
-_TWIN_OFF_M: Final = 1.0  # in that time, maximum distance of a newcomer from the target's expected position ...
+_OF_LATE: Final = 8  # number of images over which the mean difference is averaged
+_TWIN: Final = 0.6  # colour difference below which only position and motion distinguish an object from the target
+_TWIN_S: Final = 60.0  # time after the last sighting of a look-alike during which a newcomer may be that look-alike
+_TWIN_OFF_M: Final = 1.0  # maximum distance of a newcomer from the target's expected position during this time ...
 _TWIN_OFF_M_S: Final = 0.5  # ... plus this for each second unseen [m/s]
-_OTHER_WAY_M_S: Final = 2.2  # maximum change from the target's velocity before it was hidden to a newcomer's
+_OTHER_WAY_M_S: Final = 2.2  # maximum difference between a newcomer's velocity and the target's before it was hidden
 _GOES_ON_S: Final = 6.0  # time for which a hidden target is assumed to keep its direction
-_CLEARLY: Final = 1.0  # margin by which all other newcomers must be less similar
+_CLEARLY: Final = 1.0  # minimum difference in similarity to the second most similar newcomer
 _FAST_M_S: Final = 4.0  # maximum assumed speed of an unseen object
-_KEPT_FRAMES: Final = 12  # number of frames kept for detections that arrive late
+_KEPT_FRAMES: Final = 12  # number of recent frames kept for detections that arrive late
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +55,8 @@ class Sighting:
     """The result of searching one image."""
 
     box: Box | None  #: x, y, width, height [px]; None if the target was not found
-    confidence: float | None  #: 0 to 1: the probability that the tracker is right, or a detection's score
-    contested: bool = False  #: the target may be in view, but the sighting may be of another object
+    confidence: float | None  #: probability that the tracker is right, or score of a detection, 0 to 1
+    contested: bool = False  #: whether the target may be in view but is indistinguishable from another object
 
 
 @dataclass(slots=True, eq=False)
@@ -78,16 +79,16 @@ class TargetFinder:
         nominal_m: float = 4.0,
         relative: bool = False,
     ) -> None:
-        """Initialise the finder with the target's box in the first image [px], or a class: its largest detection.
+        """Initialise the finder with the target's box in the first image [px] or with a class.
 
-        ``nominal_m`` is the initial distance if there is no cue; if ``relative``, the vehicle does not know its own
-        velocity.
+        Given only a class, the target is its largest detection. ``nominal_m`` is the initial range if there is no cue.
+        ``relative`` means that the vehicle does not know its own velocity.
         """
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
-        self.estimator: TargetEstimator | None = None  #: the target's motion; None before the first sighting
+        self.estimator: TargetEstimator | None = None  #: filter for the target's motion; None before the first sighting
         self.class_name = class_name
-        self.detections: tuple[Detection, ...] = ()  #: detections in the newest image searched by a detector
+        self.detections: tuple[Detection, ...] = ()  #: detections in the newest image that a detector searched
         self._first_box = box
         self._given, self._unnamed = traits, class_name is None
         self._nominal_m, self._relative = nominal_m, relative
@@ -98,17 +99,17 @@ class TargetFinder:
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
         self._middle: tuple[float, float] | None = None  # expected position of the target in the newest image [px]
         self._doubts = 0
-        self._twin_ns: int | None = None  # time of the last sighting of a look-alike in addition to the target
-        self._newcomers: dict[int, tuple[int, float]] = {}  # number of images, and mean unlikeness to the target
+        self._twin_ns: int | None = None  # last time when a look-alike was in view in addition to the target
+        self._newcomers: dict[int, tuple[int, float]] = {}  # number of images, mean colour difference from the target
         self._ground = False  # whether the camera's height above the ground is known in the newest image
-        self._agreed = 0  # number of consecutive images in which tracker and detection agree
+        self._agreed = 0  # number of consecutive images in which tracker and detector agree
 
     def see(
         self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
     ) -> Sighting:
-        """Find the target in the next image; ``detections`` are None if it was not searched.
+        """Find the target in the next image; ``detections`` is None if no detector searched it.
 
-        ``ground`` tells whether the camera's height above the ground is known.
+        ``ground`` states whether the camera's height above the ground is known.
         """
         self._frames.append(_Seen(image, camera, captured_ns))
         self._ground = ground
@@ -132,10 +133,10 @@ class TargetFinder:
         return sighting
 
     def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> bool:
-        """Use detections that arrive after their image; return whether they show, or may show, the target.
+        """Use detections that arrive after their image was processed; return whether they show or may show the target.
 
-        If the tracker missed the target in that image or found it elsewhere, it restarts from there. Detections are
-        ignored if their image is not among the last ones given to :meth:`see`.
+        If the tracker missed the target in that image or found it elsewhere, it restarts from the detection. Detections
+        are ignored if their image is not among the last ones passed to :meth:`see`.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
@@ -147,10 +148,10 @@ class TargetFinder:
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
-            # The target is identified without the tracker, whose model failed to recognise it: so drop that model.
+            # The detector has identified the target and the tracker has not, so drop the tracker's model.
             self._tracking = self._tracking and frame.box is not None
             self._resume(frame.image, target.detection.box)
-            # The tracker's next step begins in that image, not in the newest one.
+            # The tracker's next step starts from that image, not from the newest one.
             self._middle = frame.camera.pixel(target.estimator.at(captured_ns).middle)
         return True
 
@@ -160,7 +161,7 @@ class TargetFinder:
         return None if self._scene is None or self._number is None else self._scene.objects.get(self._number)
 
     def candidate(self, at_ns: int) -> TargetState | None:
-        """Return the state of a recently seen object that may be the lost target and deserves a closer look."""
+        """Return the state of a recently seen object that may be the lost target and is worth a closer look."""
         scene, found = self._scene, None
         if scene is None or self._number not in scene.dormant:
             return None
@@ -183,7 +184,7 @@ class TargetFinder:
         ]
 
     def _shift(self, camera: Camera, captured_ns: int) -> None:
-        """Tell the tracker how far rotation, flight and the target's own motion have moved the target in the image."""
+        """Shift the tracker by the image motion expected from rotation, flight and the target's own motion."""
         if self.estimator is None or self._middle is None:
             return
         middle = camera.pixel(self.estimator.at(captured_ns).middle)
@@ -212,7 +213,7 @@ class TargetFinder:
                 self._resume(image, box)
             return Sighting(box, tracked.confidence if agrees else target.detection.score)
         contested = target is not None and target.contested
-        # It is unknown which of two objects the tracker followed while they appeared as one.
+        # While two objects appeared as one, it is unknown which one the tracker followed.
         unsure = target is not None and target.contested_ns > (target.estimator.seen_ns or 0)
         if tracked.box is None or unsure or self._is_taken(tracked.box):
             return Sighting(None, None, contested)
@@ -239,7 +240,7 @@ class TargetFinder:
         return Sighting(box, tracked.confidence)
 
     def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
-        """Return whether an unseen target can have reached the tracker's box and, if so, move the estimate there."""
+        """Return whether an unseen target could have reached the tracker's box and, if so, move the estimate there."""
         assert estimator.seen_ns is not None
         unseen_s = seconds(captured_ns - estimator.seen_ns)
         if unseen_s < _DORMANT_S or self._number is not None:
@@ -254,10 +255,10 @@ class TargetFinder:
         return True
 
     def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
-        """Return whether the tracker's box may be the target's, according to the detector.
+        """Return whether the detector allows the tracker's box to be the target's.
 
-        The tracker may stay on whatever hides the target. If the detector knows the target, trust the tracker only
-        between searched images, and only for a second.
+        The tracker may get stuck on an object that hides the target. If the detector knows the target, the tracker is
+        therefore trusted only between searched images, and only for a second.
         """
         target, scene = self.target, self._scene
         if box is None or target is None or scene is None or target.seen:
@@ -267,7 +268,7 @@ class TargetFinder:
         return detections is None or any(overlap(one.box, box) >= _SAME for one in detections)
 
     def _is_taken(self, box: Box) -> bool:
-        """Return whether the box belongs to another object, according to that object's detection in this image."""
+        """Return whether the box belongs to another object that was detected in this image."""
         if self._scene is None or self._number is None:
             return False
         now, taken = self._frames[-1].captured_ns, _TAKEN * box[2] * box[3]
@@ -303,7 +304,7 @@ class TargetFinder:
         if target is not None:
             if target.seen and self._is_unsure(scene, target):
                 target.estimator = self._learning(target, frame, back=True)
-            self.estimator = target.estimator  # two confused objects may have been exchanged
+            self.estimator = target.estimator  # confused objects may have been exchanged
         if target is None:
             self._choose(scene, frame, tracked)
         elif target.number in scene.dormant:
@@ -334,7 +335,7 @@ class TargetFinder:
             self._adopt(scene, best, frame)
 
     def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
-        """Accept a newcomer as the target if it can be the target, looks like it, and is the only such object."""
+        """Accept a newcomer as the target if its position is plausible and it is the only object that looks like it."""
         assert target.estimator.seen_ns is not None
         likely: list[tuple[float, SceneObject]] = []
         for each in scene.objects.values():
@@ -346,7 +347,7 @@ class TargetFinder:
                 continue
             images, mean = self._newcomers.get(each.number, (0, 0.0))
             if images and not self._is_expected(target, each, mean, frame.captured_ns):
-                images = 0  # start over, because two objects may have merged in an image
+                images = 0  # start over because two objects may have merged in an image
             if each.whole:
                 images += 1
                 mean += (unlikeness(target.looks, each.places) - mean) / min(images, _OF_LATE)
@@ -360,16 +361,16 @@ class TargetFinder:
         if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
-            return  # they are indistinguishable
+            return  # the candidates are indistinguishable
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
-        # When an object reappears, its first boxes also show the occluder, so keep the old colours.
+        # The first boxes of a reappearing object also show the occluder, so keep the old colours.
         found.looks, found.hits = target.looks, target.hits + found.hits
         self._adopt(scene, found, frame, back=True)
         del scene.objects[target.number]
 
     def _note_twins(self, scene: Scene, target: SceneObject, at_ns: int) -> None:
-        """Note whether a look-alike is in view in addition to the target."""
+        """Record whether a look-alike is in view in addition to the target."""
         if target.seen and any(
             each.seen and each.whole and each.confirmed and unlikeness(target.looks, each.looks) < _TWIN
             for each in scene.objects.values()
@@ -378,7 +379,7 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Return whether a newcomer moves like the target and, if there is a twin, is where the target should be."""
+        """Return whether a newcomer moves like the target and, if there is a look-alike, is where it is expected."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
@@ -392,13 +393,13 @@ class TargetFinder:
         return self.class_name is None or each.class_name == self.class_name
 
     def _is_unsure(self, scene: Scene, thing: SceneObject) -> bool:
-        """Return whether an object is assumed to be on the ground but might hang on a wall."""
+        """Return whether an object that is assumed to be on the ground might instead hang on a wall."""
         traits = scene.traits.get(thing.class_name)
         unsure = traits is None or (traits is self._given and self._unnamed and traits.on_ground is None)
         return unsure and not isinstance(thing.estimator, RangeEstimator)
 
     def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
-        """Return the filter that learns the range of an object seen in a frame; with ``back``, of a returned target."""
+        """Return a filter that learns the range of an object in a frame; ``back`` means that a lost target returned."""
         before = self.estimator
         if isinstance(before, RangeEstimator) and not back:
             return before
@@ -413,7 +414,7 @@ class TargetFinder:
         return new
 
     def _adopt(self, scene: Scene, thing: SceneObject, frame: _Seen, *, back: bool = False) -> None:
-        if self._given is not None and self.class_name is None:  # the user's traits take precedence over the class's
+        if self._given is not None and self.class_name is None:  # traits from the user take precedence over the class
             scene.traits[thing.class_name] = self._given
             if self.estimator is not None:
                 thing.estimator = self.estimator

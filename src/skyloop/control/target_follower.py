@@ -1,7 +1,7 @@
-"""Follow any target: the content of a box in the image, or any object of a class.
+"""Follow any target, given by a box in the image or by a class of objects.
 
-:class:`TargetFollower` finds the target in frames and computes the set-points; it has no thread or clock.
-:class:`FollowTarget`, or a page, gives it frames and feedback and sends the set-points.
+:class:`TargetFollower` finds the target in frames and computes set-points; it uses no thread or clock.
+:class:`FollowTarget`, or a page, passes frames and feedback to it and sends the set-points.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LOST: Final[Colour] = (255, 180, 60)
 _OTHER: Final[Colour] = (150, 150, 150)
 _TRACE_S: Final = 4.0  # duration of the drawn track
 _TRACE_EACH_S: Final = 0.2  # interval between points of the drawn track
-_FEET_M: Final = 0.08  # distance of the feet below the body's centre; heights are measured from the feet
+_FEET_M: Final = 0.08  # vertical distance from the feet, from which heights are measured, to the body's centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,37 +49,37 @@ class FollowStatus:
     phase: str
     mode: FollowMode
     box: Box | None  #: box of the target in the newest frame [px]; None if the frame does not show it
-    confidence: float | None  #: confidence, 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
+    confidence: float | None  #: see :attr:`skyloop.control.target_finder.Sighting.confidence`
     class_name: str | None
-    predicted_px: tuple[float, float] | None = None  #: expected position of the target's middle in the newest frame
-    range_m: float | None = None  #: horizontal distance from the camera
+    predicted_px: tuple[float, float] | None = None  #: expected position of the target's centre in the newest frame
+    range_m: float | None = None  #: horizontal distance from the camera to the target
     range_deviation_m: float | None = None
     bearing_rad: float | None = None  #: angle to the target, counter-clockwise from straight ahead
     speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own
-    lost_s: float = 0.0  #: time since the last sighting; 0 while the target is in sight and before the first sighting
-    problem: str = ""  #: why following as wanted is not possible; empty if it is
-    unknown: str = ""  #: unknown part of the vehicle's motion, which makes it hover whatever the set-point
+    lost_s: float = 0.0  #: time since the last sighting; 0 while the target is in view or before the first sighting
+    problem: str = ""  #: why the target can't be followed as requested; empty if it can
+    unknown: str = ""  #: unknown part of the vehicle's motion, which makes it hover regardless of the set-point
 
 
 class TargetFollower(AirframeLaw):
-    """Follows a target. Call it from one thread."""
+    """Follows a target; to be called from one thread only."""
 
     def __init__(
         self,
-        camera: CameraInfo,  # the camera, including its mounting; it must look forward
+        camera: CameraInfo,  # the camera, including its mounting; it must face forward
         *,
         box: Box | None = None,  # box of the target in the first frame given to :meth:`look`: x, y, width, height [px]
-        # class of which to follow the largest object if there is no box; needs detections
+        # class whose largest object to follow if there is no box; requires detections
         class_name: str | None = None,
-        mode: FollowMode = FollowMode.FOLLOW,  # how to follow
-        detector: ObjectDetector | None = None,  # detector to run on every frame on the thread that calls :meth:`look`
-        detects: bool = False,  # whether detections arrive from elsewhere through :meth:`detected`
-        traits: Traits | None = None,  # prior knowledge about the target; None for that of its class
-        settings: ChaseSettings | None = None,  # settings of the law; None for the defaults
+        mode: FollowMode = FollowMode.FOLLOW,  # how to follow the target
+        detector: ObjectDetector | None = None,  # detector for every frame, on the thread that calls :meth:`look`
+        detects: bool = False,  # whether detections from elsewhere arrive through :meth:`detected`
+        traits: Traits | None = None,  # prior knowledge about the target; None to use that of its class
+        settings: ChaseSettings | None = None,  # settings for the control law; None for the defaults
     ) -> None:
-        """Initialise the follower; UsageError without a target, or for a camera that does not look forward."""
+        """Initialise the follower; raise UsageError if there is no target or the camera does not face forward."""
         if mounting_rotation(camera)[0, 2] < 0.5:
-            raise UsageError(f"camera {camera.name!r} does not look forward, as following needs")
+            raise UsageError(f"camera {camera.name!r} does not face forward, as is required for following")
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
         if box is None and detector is None and not detects:
@@ -100,7 +100,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def settings(self) -> ChaseSettings:
-        """Goal, gains and limits. Can be replaced in flight."""
+        """Goals, gains and limits, which can be replaced in flight."""
         return self._law.settings
 
     @settings.setter
@@ -109,7 +109,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def mode(self) -> FollowMode:
-        """How to follow the target. Can be changed in flight."""
+        """How to follow the target, which can be changed in flight."""
         return self._law.mode
 
     @mode.setter
@@ -118,12 +118,12 @@ class TargetFollower(AirframeLaw):
 
     @property
     def phase(self) -> TargetPhase:
-        """Phase at the last set-point."""
+        """Phase when the last set-point was computed."""
         return self._law.phase
 
     @property
     def over(self) -> bool:
-        """Whether the follower has given up."""
+        """Whether the follower has given up on the target."""
         return self.phase is TargetPhase.GIVEN_UP
 
     def feedback(self, feedback: Feedback) -> None:
@@ -135,7 +135,7 @@ class TargetFollower(AirframeLaw):
             self._law.feedback(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart the set-points from rest and keep the target."""
+        """Restart the set-points from rest, but keep the target."""
         super().pause()
         self._law.pause()
 
@@ -145,14 +145,14 @@ class TargetFollower(AirframeLaw):
         return self.airframe.by_tilt
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target in the next frame, from the given box on; return the box, track and phase to draw.
+        """Find the target in the next frame and return the shapes to draw: its box, its track and the phase.
 
-        The first box must fit into the image, and the camera's intrinsics must be known, or this raises UsageError.
+        Raises UsageError if the first box does not fit into the image or the camera's intrinsics are unknown.
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
-            state = None  # the frame is stamped ahead or there is no recent feedback, so the pose is unknown
-        # A vehicle without a known velocity hovers at its last position.
+            state = None  # the frame's time is in the future or there is no recent feedback, so the pose is unknown
+        # If the velocity is unknown, the vehicle hovers, so its last position is used.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
@@ -164,7 +164,7 @@ class TargetFollower(AirframeLaw):
             body[2] = state.altitude_m + _FEET_M
         rates = (0.0, 0.0)
         if state.angular_velocity_rad_s is None and state.yaw_rad is not None:
-            # Without a gyroscope, the attitude arrives rarely and images are stamped on arrival.
+            # Vehicles without gyroscope data rarely report their attitude, and their images are stamped on arrival.
             rates = motion.yaw_rate, self.airframe.tilt_rate_rad_s
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
@@ -189,16 +189,16 @@ class TargetFollower(AirframeLaw):
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
-        """Use a processor's detections for a recent frame, which arrive after that frame."""
+        """Use detections from a processor, which arrive after the frame they belong to."""
         if self.finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
             if self.finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
-        """Compute the set-point for now [ns on the proxy's clock], or hold the vehicle while its motion is unknown.
+        """Compute the current set-point, which makes the vehicle hover while its motion is unknown.
 
-        A vehicle that does not report its velocity is flown by attitude.
+        Vehicles that don't report their velocity are flown by attitude. ``now_ns`` is on the proxy's clock.
         """
         if not self._ready(now_ns):
             return Attitude() if self._relative else Velocity()
@@ -223,7 +223,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def status(self) -> FollowStatus:
-        """The state of the pursuit at the newest frame and set-point."""
+        """The state of the pursuit as of the newest frame and set-point."""
         estimator, at_ns = self._estimator, self._frame_ns
         box, confidence = self.sighting.box, self.sighting.confidence
         class_name = self._class_name if self.finder is None else self.finder.class_name
@@ -257,7 +257,7 @@ class TargetFollower(AirframeLaw):
         assert view is not None
         box = self.sighting.box
         colour = _SEEN if box is not None else _LOST
-        # A processor draws its own detections on their frames.
+        # Detections from a processor are not drawn here, because the processor annotates its frames itself.
         found = () if self._detector is None else self.finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
@@ -286,15 +286,15 @@ class TargetFollower(AirframeLaw):
 
 
 class FollowTarget(Behaviour):
-    """Keeps a target in view at a distance, circles it, or only turns towards it. The vehicle must be airborne.
+    """Keeps a target in view at a distance, circles it or only turns towards it. The vehicle must be airborne.
 
-    The target is the content of a box in the first frame, or the largest object of a class. It is tracked by appearance
-    and, with a detector, by its detections, and is not confused with look-alikes. While it is hidden, the vehicle first
-    follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour ends in a hover. The
-    vehicle needs neither a position nor a map. A vehicle that reports no velocity is flown by attitude.
+    The target is the object in a box in the first frame, or the largest object of a class. It is tracked by appearance
+    and, if there is a detector, by detections, and is distinguished from look-alikes. While the target is hidden, the
+    vehicle first follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour ends
+    in a hover. Neither a position nor a map is needed. Vehicles that report no velocity are flown by attitude.
 
     Attributes:
-        follower: Finds the target and computes the set-points.
+        follower: The object that finds the target and computes the set-points.
     """
 
     name = "follow target"
@@ -320,23 +320,23 @@ class FollowTarget(Behaviour):
         Args:
             drone: The drone to fly.
             box: Box of the target in the first frame: x, y, width, height [px].
-            class_name: Class of which to follow the largest object if there is no box. Needs a detector.
-            distance_m: Horizontal distance to keep; None for that of the settings.
-            bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion:
-                0 is ahead of it, π behind. None for any side, or for that of the settings.
+            class_name: Class whose largest object to follow if there is no box; requires a detector.
+            distance_m: Horizontal distance to keep; None for the distance in the settings.
+            bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
+                ahead of it, π behind it. If None, the settings apply, which allow any side by default.
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Detector that searches every frame, or the name of a processor whose results are detections, such
-                as that of ``skyloop detect``. None tracks the target by appearance only.
-            height_m: The target's height, if known, to estimate its distance; otherwise its class determines the
-                height. With neither, the drone only turns until its own motion has revealed the range.
-            traits: Complete prior knowledge about the target, instead of ``height_m``.
+                as that of ``skyloop detect``. If None, the target is tracked by appearance only.
+            height_m: The target's height, if known, for estimating its distance; by default, that of its class. If
+                neither is available, the drone only turns until its own motion has revealed the range.
+            traits: All prior knowledge about the target, as an alternative to ``height_m``.
             camera: Camera to use; None for the vehicle's first camera.
             settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera.
-            UsageError: There is neither a box nor a class, the camera does not look forward, a number is out of its
-                range, or the vehicle neither reports velocity nor accepts attitude set-points.
+            UsageError: There is neither a box nor a class, the camera does not face forward, a number is out of range,
+                or the vehicle neither reports its velocity nor accepts attitude set-points.
             MissingExtraError: OpenCV or, for detections, SciPy is not installed.
         """
         given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
@@ -347,7 +347,7 @@ class FollowTarget(Behaviour):
         if mode not in list(FollowMode):
             raise UsageError(f"mode is {mode!r} and must be one of {', '.join(FollowMode)}")
         if detector is not None and not isinstance(detector, str | ObjectDetector):
-            raise UsageError(f"detector is {detector!r} and needs a detect(image) method, or must name a processor")
+            raise UsageError(f"detector is {detector!r} and must have a detect(image) method or name a processor")
         self.follower = TargetFollower(
             camera_info(drone, camera),
             box=None if box is None else _box(box),
@@ -368,21 +368,21 @@ class FollowTarget(Behaviour):
 
     @property
     def status(self) -> FollowStatus:
-        """The state of the pursuit at the newest frame."""
+        """The state of the pursuit as of the newest frame."""
         return self.follower.status
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target."""
+        """Find the target in a frame."""
         return self.follower.look(frame)
 
     def on_frame(self, frame: Frame) -> None:
-        """Find the target and steer. After ``give_up_s``, hover and let :meth:`run` return."""
+        """Find the target and steer; after ``give_up_s``, hover and make :meth:`run` return."""
         super().on_frame(frame)
         if self.follower.over and not self.done:
             self.finish("gave up: the target was lost for too long")
 
     def on_result(self, result: Result) -> None:
-        """Use a processor's detections in frames from this behaviour's camera; ignore those from other cameras."""
+        """Use a processor's detections if they are from this behaviour's camera."""
         if result.camera == self._mounting.name:
             self.follower.detected(detections_of(result.value), result.captured_ns)
 

@@ -1,14 +1,14 @@
-"""The range of a target that may not be on the ground: bearings decide between several hypotheses. Pure.
+"""Range estimation for targets that may not be on the ground, using bearings to choose between hypotheses. Pure.
 
-A box drawn by a person may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
-only for a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and the filter
-would be wrongly sure of it. Being on the ground is therefore one of several hypotheses; the others are at ranges from
-near to far, with a filter each (T. R. Kronhamn, "Bearings-only target motion analysis based on a multihypothesis Kalman
-filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995).
-While the vehicle is at rest, all hypotheses fit. Once it has moved, above all up or down, where targets hardly move,
-those at a wrong range no longer fit.
-An altimeter over rising ground, or one that drifts, reports motion that did not happen. For a target that may be off
-the ground, the camera's height therefore follows the vehicle's own climb, and the altimeter only slowly.
+A box drawn by a user may contain a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
+only if the target is on the ground: a picture on a wall whose lower edge is just below the vehicle would seem far away,
+and the filter would be overconfident. Being on the ground is therefore only one of several hypotheses. The others
+assume ranges from near to far, and each has its own filter (T. R. Kronhamn, "Bearings-only target motion analysis based
+on a multihypothesis Kalman filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE
+Proceedings 142(1), 1995). While the vehicle is at rest, all hypotheses fit. Once it has moved, hypotheses with a wrong
+range no longer fit. Vertical motion works best, because targets hardly move vertically. An altimeter that drifts or
+passes over rising ground reports motion that did not happen. For a target that may be off the ground, the camera's
+height is therefore taken from the vehicle's own climb and follows the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -36,46 +36,46 @@ from skyloop.control.target_estimate import (
 _RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # initial ranges of the hypotheses, up to 29 m
 _SHARE: Final = 0.3  # standard deviation of each range, as a fraction of the range
 _ON_GROUND: Final = 0.5  # prior probability that the target is on the ground
-_AS_BEFORE: Final = 0.5  # standard deviation of the log range of a target seen before
-_TOGETHER_S: Final = 0.3  # time within which boxes count as one, because a tracker's errors persist
+_AS_BEFORE: Final = 0.5  # standard deviation of the log range of a target that was seen before
+_TOGETHER_S: Final = 0.3  # time within which several boxes count as one, because a tracker's errors persist
 _WORST: Final = 50.0  # maximum cost of a single box for a hypothesis
 _LEAST: Final = 1e-3  # minimum probability of a hypothesis; less likely ones are dropped
-_KNOWN: Final = 0.2  # relative deviation below which the range becomes known
-_UNKNOWN: Final = 0.4  # relative deviation above which it becomes unknown again
-_STIRRED_M: Final = 0.1  # offset from the vehicle's recent position from which a box has its full weight
-_OF_LATE_S: Final = 2.0  # averaging time of the recent position
-_BASELINE: Final = 0.015  # offset per range that the vehicle must have reached before the range is known
-_JUMP_M: Final = 0.15  # maximum change of the vehicle's height at once, ...
-_JUMP_M_S: Final = 1.0  # ... and its maximum speed: otherwise the altimeter now measures to another object
-_JUMPING_S: Final = 0.5  # maximum duration of a jump of a filtered altimeter
-_STEADY_S: Final = 30.0  # time constant of the camera's height following the altimeter, if the climb is known
-_APART_M: Final = 3.0  # maximum difference of ground and climb; a larger one means that the climb was lost
+_KNOWN: Final = 0.2  # relative deviation below which the range counts as known
+_UNKNOWN: Final = 0.4  # relative deviation above which the range counts as unknown again
+_STIRRED_M: Final = 0.1  # distance from the vehicle's recent position at which boxes get their full weight
+_OF_LATE_S: Final = 2.0  # averaging time for the recent position
+_BASELINE: Final = 0.015  # minimum ratio of the vehicle's displacement to the range before the range is known
+_JUMP_M: Final = 0.15  # maximum sudden change of the vehicle's height ...
+_JUMP_M_S: Final = 1.0  # ... plus this per second; beyond that, the altimeter sees another surface
+_JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter takes for a jump
+_STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter if the climb is known
+_APART_M: Final = 3.0  # maximum deviation of altimeter and climb; if larger, the climb is no longer valid
 
 
 class RangeEstimator(TargetEstimator):
-    """The filters for one target that may or may not be on the ground."""
+    """The filters for a target that may or may not be on the ground."""
 
     def __init__(
         self, traits: Traits, *, nominal_m: float = 4.0, relative: bool = False, before: TargetState | None = None
     ) -> None:
-        """Initialise the filters; ``before`` is the target's state when it was lost, if its range was known."""
+        """Initialise the filters; ``before`` is the state in which the target was lost, if its range was known."""
         super().__init__(traits, nominal_m=nominal_m, relative=relative)
         self._seen_before = before
         self._guesses: list[TargetEstimator] = []
         self._weights = np.ones(0)
-        self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground, until dropped
-        self._sight = self._about = np.zeros(3)  # first line of sight; recent mean position of the vehicle
-        self._stirred_m = 0.0  # maximum distance from that position so far, across that line
+        self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground; None once dropped
+        self._sight = self._about = np.zeros(3)  # initial line of sight, and recent mean position of the vehicle
+        self._stirred_m = 0.0  # maximum distance from that position so far, across that line of sight
         self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
         self._jumped_ns: int | None = None  # time of the last jump of the height
-        self._base_m = 0.0  # long-term altimeter height from which the climb is measured
+        self._base_m = 0.0  # averaged difference between altimeter and climb [m]
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
         """Start from the first box, as in :meth:`TargetEstimator.start`.
 
-        Without a known height, nothing can tell the hypotheses apart: the range is the nominal one, and the law keeps
-        the apparent size.
+        If the camera's height is unknown, the hypotheses can't be distinguished. In that case the nominal range is
+        used, and the control law keeps the apparent size constant.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
         self._base_m = _off_climb(camera)
@@ -85,7 +85,7 @@ class RangeEstimator(TargetEstimator):
         if ground and below and self.traits.on_ground is not False:
             self._on_ground = self._member(view, camera, at_ns, on_ground=True)
             weights.append(_ON_GROUND)
-        stood = self._on_ground is not None and self.traits.on_ground  # known from before
+        stood = self._on_ground is not None and self.traits.on_ground  # prior knowledge
         if not stood and (self._size_known or not ground):
             self._member(view, camera, at_ns, on_ground=False)
             weights.append(1.0 - _ON_GROUND)
@@ -103,20 +103,20 @@ class RangeEstimator(TargetEstimator):
         self._judge(self.at(at_ns))
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
-        """Measure how badly a box fits, like :meth:`TargetEstimator.distance`: the best fit, and the mixture's."""
+        """Measure how badly a box fits the best hypothesis and the mixture; see :meth:`TargetEstimator.distance`."""
         seen_from = self._seen_from(camera, self._steady(camera))
         fits, costs = zip(*(guess.distance(view, one, at_ns) for guess, one in seen_from), strict=True)
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box like :meth:`TargetEstimator.update`, and drop hypotheses that don't fit it.
+        """Update with a box, as in :meth:`TargetEstimator.update`, and drop hypotheses that no longer fit.
 
-        The filters restart if the vehicle's height jumps, because someone walks below it, it flies over a table, or its
-        height is unknown for a moment. Such apparent motion would otherwise "prove" that the target is far away.
+        The filters restart if the measured height jumps, because someone walks under the vehicle, it flies over a table
+        or its height was unknown. Such apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:
-            return super().update(view, camera, at_ns)  # raises the error
+            return super().update(view, camera, at_ns)  # raises UsageError
         apart_m, since_s = _off_climb(camera) - self._base_m, seconds(at_ns - self.seen_ns)
         if self._learns and (self._jumps(camera, at_ns) or abs(apart_m) > _APART_M):
             self._seen_before = self.at(at_ns) if self._known else self._seen_before
@@ -131,7 +131,7 @@ class RangeEstimator(TargetEstimator):
             self.refused += 1
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
-        # Boxes from a resting vehicle carry no information: the one with the least motion would slowly win.
+        # Boxes seen while the vehicle is at rest carry no information, but would slowly favour the stillest hypothesis.
         stirred = self._stir(steady, since_s) / _STIRRED_M
         weight = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
@@ -141,9 +141,9 @@ class RangeEstimator(TargetEstimator):
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state like :meth:`TargetEstimator.at`: the hypotheses' mean, with its deviation."""
+        """Predict the target's state, as in :meth:`TargetEstimator.at`: the mean and deviation of all hypotheses."""
         if self.seen_ns is None:
-            return super().at(at_ns)  # raises the error
+            return super().at(at_ns)  # raises UsageError
         states = [guess.at(at_ns) for guess in self._guesses]
         weights = self._weights
 
@@ -175,7 +175,7 @@ class RangeEstimator(TargetEstimator):
         return True if self._known and likeliest is self._on_ground else None
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return the filter, not started yet, for the same target when it comes back into view."""
+        """Return a new filter, not started yet, for the same target once it comes back into view."""
         before, stands = self.at(at_ns), self.on_ground
         traits = self.traits if stands is None else replace(self.traits, on_ground=stands)
         return RangeEstimator(
@@ -204,18 +204,18 @@ class RangeEstimator(TargetEstimator):
             self._on_ground = None
 
     def _steady(self, camera: Camera) -> Camera:
-        """Return the camera at a height that follows the vehicle's own climb."""
+        """Return the camera with a height derived from the vehicle's own climb."""
         if camera.rise_m is None:
             return camera
         x, y, _ = camera.position
         return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
 
     def _seen_from(self, camera: Camera, steady: Camera) -> list[tuple[TargetEstimator, Camera]]:
-        """Return each hypothesis with its camera, which is at the altimeter's height for a target on the ground."""
+        """Return each hypothesis with its camera; the ground hypothesis uses the altimeter's height."""
         return [(guess, camera if guess is self._on_ground else steady) for guess in self._guesses]
 
     def _jumps(self, camera: Camera, at_ns: int) -> bool:
-        """Return whether the height is jumping or jumped a moment ago."""
+        """Return whether the height is jumping or has just jumped."""
         height, heights = float(camera.position[2]), self._heights
         while len(heights) > 1 and abs(seconds(at_ns - heights[0][0])) > _JUMPING_S:
             heights.popleft()
@@ -225,7 +225,7 @@ class RangeEstimator(TargetEstimator):
         return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
     def _stir(self, camera: Camera, since_s: float) -> float:
-        """Return the vehicle's distance from its recent position, measured across the first line of sight [m]."""
+        """Return the vehicle's distance [m] from its recent position, measured across the initial line of sight."""
         self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
         x, y, z = (camera.position - self._about).tolist()
         off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)
@@ -244,14 +244,14 @@ class RangeEstimator(TargetEstimator):
 
 
 def _off_climb(camera: Camera) -> float:
-    """Return the difference between height and climb [m]."""
+    """Return the camera's height minus the vehicle's climb [m]; 0 if the climb is unknown."""
     return 0.0 if camera.rise_m is None else float(camera.position[2]) - camera.rise_m
 
 
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Create the filter for a target, to be started; without a class, a person drew a box."""
+    """Create a filter for a target, not started yet; ``class_name`` is None for a box drawn by a user."""
     if traits is not None and (class_name is not None or traits.on_ground is not None):
         return TargetEstimator(traits, nominal_m=nominal_m, relative=relative)
     return RangeEstimator(traits or UNKNOWN, nominal_m=nominal_m, relative=relative)

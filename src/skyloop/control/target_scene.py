@@ -1,9 +1,9 @@
-"""Match detections to objects, which keep their identity while they cross, hide and return. Pure.
+"""Match detections to objects, which keep their identities when they cross, hide and return. Pure.
 
-Detections are matched with filters of where the objects are now, not with their positions in the last image, so that
-the vehicle's own motion does no harm and look-alikes are distinguished by position and motion. The pairs are the most
-likely assignment overall (SciPy's ``linear_sum_assignment``). A detection that another object could explain nearly as
-well updates neither object: both continue on their predicted motion until they are apart.
+Detections are matched with filtered estimates of the objects' current positions, not with their positions in the last
+image. The vehicle's own motion therefore does not matter, and look-alikes are distinguished by position and motion. The
+pairs form the most likely overall assignment (SciPy's ``linear_sum_assignment``). If two objects explain a detection
+almost equally well, it updates neither. Both then continue on their predicted paths until they separate.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from skyloop.vision.object_tracks import Detection
 
 Floats = NDArray[np.float32]
 
-_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b: light changes L most
-_OTHER: Final = 10.0  # unlikeness of different objects; that of the same object is mostly below 0.5, at times 3
-_OTHER_AGAIN: Final = 3.0  # the same for an object that was briefly unseen
-_MOMENT_S: Final = 0.3  # time unseen after which _OTHER_AGAIN applies
-_UNLIKE: Final = 3.0  # weight of the unlikeness relative to the position
-_LEARNING: Final = 0.05  # learning rate of the colours per detection; the first ones are averaged
+_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b; lighting affects L most
+_OTHER: Final = 10.0  # colour difference between objects; for the same object it is usually below 0.5, sometimes 3
+_OTHER_AGAIN: Final = 3.0  # the same for an object that was briefly out of view
+_MOMENT_S: Final = 0.3  # time out of view after which _OTHER_AGAIN applies
+_UNLIKE: Final = 3.0  # weight of the colour difference relative to the position
+_LEARNING: Final = 0.05  # learning rate of the colours per detection; the first few are averaged
 _GATE: Final = 9.0  # maximum squared Mahalanobis distance per measurement
-_NEVER: Final = 1e6  # cost of a pair that must not match
-_AMBIGUOUS: Final = 4.0  # minimum difference of the doubled negative log-likelihood; smaller ones are ambiguous
-_LATELY_S: Final = 1.2  # maximum time unseen for an object that a detection may show
-_TOGETHER_S: Final = 3.0  # time after which two objects detected as one are considered one
-_FAR_BEHIND: Final = 1.3  # ratio of ranges from which an object behind another one is hidden, not in its box
-_EARLIER_S: Final = 0.5  # time before two meet at which their merging boxes don't distort their velocities yet
-_APART_S: Final = 0.6  # time after they part at which their velocities are known
-_DIFFER_M_S: Final = 0.8  # difference of the velocities before, needed to tell two objects apart
-_TURNED: Final = 0.3  # reversed fraction of that difference from which two objects were confused
-_KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different one
+_NEVER: Final = 1e6  # cost of an impossible pair
+_AMBIGUOUS: Final = 4.0  # difference of the doubled negative log-likelihood below which a match is ambiguous
+_LATELY_S: Final = 1.2  # maximum time since an object was last seen for it to explain a detection
+_TOGETHER_S: Final = 3.0  # time after which two objects detected as one count as one
+_FAR_BEHIND: Final = 1.3  # ratio of ranges above which an object is hidden by another one, not part of its box
+_EARLIER_S: Final = 0.5  # time before a meeting at which velocities are not yet distorted by merging boxes
+_APART_S: Final = 0.6  # time after a separation at which velocities are known again
+_DIFFER_M_S: Final = 0.8  # minimum velocity difference before a meeting for telling two objects apart
+_TURNED: Final = 0.3  # reversed fraction of that difference at which two objects count as confused
+_KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different object
 _YOUNG_S: Final = 0.5  # the same for objects seen only once
 _CONFIRMED: Final = 3  # number of detections needed to confirm an object
-_OF_A_PART: Final = 1.0  # unlikeness of an object cut off by the image, because its colours differ
-_SETTLED: Final = 8  # number of detections below which an object, perhaps two in one, contests no others
-_YOUNG: Final = 4.0  # extra cost of a young object
+_OF_A_PART: Final = 1.0  # colour difference assumed for objects cut off by the image
+_SETTLED: Final = 8  # number of detections after which an object can contest others; new ones may be two in one
+_YOUNG: Final = 4.0  # extra cost for an object with few detections
 _WELL_KNOWN: Final = 15  # number of detections from which an object's colours are known
 _SURE: Final = 0.35  # minimum score of a detection that may be a new object
 
@@ -56,7 +56,7 @@ class SceneObject:
 
     number: int  #: number that identifies the object; never reused
     class_name: str  #: class of the detections
-    estimator: TargetEstimator  #: filter for the motion
+    estimator: TargetEstimator  #: filter for the object's motion
     detection: Detection  #: the last detection
     looks: Floats  #: colours, (6,): see :func:`skyloop.vision.appearance.colours`
     places: Floats  #: colours of the last detection that was not cut off by the image, (n, 6)
@@ -64,25 +64,25 @@ class SceneObject:
     first_ns: int  #: time of the first detection
     last_ns: int  #: time of the last detection
     seen: bool = True  #: whether the object was detected in the newest image
-    whole: bool = True  #: whether the last detection was of the whole object
+    whole: bool = True  #: whether the last detection showed the whole object
     contested_ns: int = 0  #: time when the object was last contested
-    contested: bool = False  #: whether a detection in the newest image may show either this or another object
+    contested: bool = False  #: whether a detection in the newest image may show this object or another one
 
-    #: velocities in the last half second
+    #: velocities of the last half second
     velocities: deque[tuple[int, NDArray[np.float64]]] = field(default_factory=deque)
 
     @property
     def confirmed(self) -> bool:
-        """Whether the object was detected often enough to be trusted."""
+        """Whether the object has been detected often enough to be trusted."""
         return self.hits >= _CONFIRMED
 
     def learn(self, places: Floats) -> None:
-        """Update the colours with those of strips in the newest detection, (n, 6)."""
+        """Update the colours with those of the strips in the newest detection, (n, 6)."""
         self.places = places
         self.looks = self.looks + max(_LEARNING, 1.0 / self.hits) * (_nearest(self.looks, places) - self.looks)
 
     def remember(self, at_ns: int) -> None:
-        """Record the current velocity for :attr:`earlier`."""
+        """Record the current velocity for later use by :attr:`earlier`."""
         self.velocities.append((at_ns, self.estimator.at(at_ns).velocity))
         while len(self.velocities) > 1 and seconds(at_ns - self.velocities[1][0]) >= _EARLIER_S:
             self.velocities.popleft()
@@ -93,7 +93,7 @@ class SceneObject:
         return self.velocities[0][1] if self.velocities else np.zeros(2)
 
     def exchange(self, other: SceneObject) -> None:
-        """Exchange everything but the numbers with another object."""
+        """Exchange motion and detections with another object, but keep numbers and colours."""
         for name in ("estimator", "detection", "hits", "last_ns", "seen", "contested", "velocities"):
             mine, its = getattr(self, name), getattr(other, name)
             setattr(self, name, its)
@@ -107,14 +107,14 @@ class _Seen(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the image shows both the upper and the lower end of the object."""
+        """Whether both the top and the bottom of the object are in the image."""
         return self.view.bottom is not None and self.view.top is not None
 
 
 def unlikeness(one: Floats, other: Floats) -> float:
-    """Return the squared colour difference between two objects, in units of the changes caused by light and folds.
+    """Return the squared colour difference of two objects, in units of the usual variation due to light and folds.
 
-    The other's colours are (6,), or those of strips of a box (n, 6), of which the most similar counts.
+    ``other`` is either (6,) or contains the colours of n strips of a box, (n, 6), of which the most similar is used.
     """
     return float(np.min(_unlike(one, other)))
 
@@ -131,13 +131,13 @@ def _unlike(one: Floats, other: Floats) -> Floats:
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
-    """Return whether an object was seen a moment ago, or may have been in view ever since."""
+    """Return whether an object was seen a moment ago or may have been in view since then."""
     seen_s = seconds(at_ns - (thing.estimator.seen_ns or 0))
     return seen_s < _LATELY_S or (seen_s < _TOGETHER_S and seconds(at_ns - thing.contested_ns) < _LATELY_S)
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Return whether a detection may show two objects: the other's middle is in the box and not far behind."""
+    """Return whether a detection may show two objects: the other one's centre is in the box and not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box
@@ -153,10 +153,10 @@ class Scene:
     """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene, with traits by class that replace :data:`~.target_estimate.TRAITS`."""
+        """Initialise an empty scene; ``traits`` by class override :data:`~.target_estimate.TRAITS`."""
         self.objects: dict[int, SceneObject] = {}  #: objects by number
         self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
-        #: numbers of objects not matched with detections, because their return is decided elsewhere
+        #: numbers of objects that are not matched with detections, because their return is decided elsewhere
         self.dormant: set[int] = set()
         self._relative = relative
         self.traits = TRAITS | (traits or {})  #: traits by class, for new objects
@@ -167,9 +167,9 @@ class Scene:
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections in the next image; ``ground`` tells whether the camera's height above it is known.
+        """Match the detections in the next image; ``ground`` states whether the camera's height above ground is known.
 
-        The looks of each are its colours: (6,), or (n, 6) for n strips from left to right.
+        ``looks`` contains the colours for each detection: (6,), or (n, 6) for n strips from left to right.
         """
         self._forget(at_ns)
         seen = [
@@ -199,7 +199,7 @@ class Scene:
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
                         costs[i, j] = cost + _UNLIKE * unlike + (0.0 if thing.hits >= _SETTLED else _YOUNG)
-        shift = float(costs.min())  # the assignment minimises sums, so all costs must be better than no pair
+        shift = float(costs.min())  # the assignment minimises sums, so impossible pairs must be the most expensive
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
         matched = {i for i, _ in pairs}
@@ -230,15 +230,15 @@ class Scene:
         return [seen[j] for j in range(len(seen)) if j not in used]
 
     def _meet(self, one: SceneObject, other: SceneObject) -> None:
-        """Remember the relative motion of two objects before they merged."""
+        """Remember the relative velocity of two objects before they merged."""
         pair = frozenset({one.number, other.number})
         if len(pair) == 2 and pair not in self._met:
             self._met[pair] = one.number, other.number, one.earlier - other.earlier
 
     def _untangle(self, at_ns: int) -> None:
-        """Exchange two objects that were confused: after they met, each moves on as the other did before.
+        """Exchange two objects that were confused: each now moves as the other did before they met.
 
-        The vehicle's own motion adds equally to both velocities, so their difference is unaffected.
+        The vehicle's own motion affects both velocities equally, so it does not change their difference.
         """
         for pair, (first, second, before) in list(self._met.items()):
             one, other = self.objects.get(first), self.objects.get(second)

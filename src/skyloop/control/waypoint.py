@@ -1,8 +1,8 @@
-"""Positions, their sources, and a law that flies to a position, turning position and yaw into a velocity.
+"""Positions, position sources, and a control law that computes the velocity for flying to a position.
 
-The law is proportional and pure. The speed is limited, and near the goal it is at most the speed from which the
-vehicle can come to rest at the goal with a given deceleration. Only the yaw is used to convert the error to the body's
-levelled axes, in which set-points are given (ROS REP 103).
+The law is purely proportional and keeps no state. The speed is limited, and near the goal it is low enough for the
+vehicle to stop there at a given deceleration. Only the yaw is used to convert the error to the body's levelled axes, in
+which set-points are given (ROS REP 103).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Waypoint:
 class WaypointSettings:
     """Gains, limits and acceptance radii. The defaults suit a small indoor vehicle with velocity control."""
 
-    gain: float = 1.2  #: speed per distance [1/s]
+    gain: float = 1.2  #: speed per metre of distance [1/s]
     yaw_gain: float = 1.5  #: [1/s]
     speed_m_s: float = 1.0  #: maximum horizontal speed
     climb_m_s: float = 0.6  #: maximum vertical speed
@@ -64,7 +64,7 @@ class WaypointSettings:
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position, and what to do about it; empty if it can."""
+    """Return why a vehicle can't be flown to a position, with a remedy; empty if it can."""
     if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
     yaw = feedback.yaw_rad
@@ -74,7 +74,7 @@ def lacking(feedback: Feedback) -> str:
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
     """Compute the velocity that brings a vehicle to a waypoint, in the body's levelled axes [m/s, rad/s].
 
-    UsageError if the vehicle's position or yaw is unknown.
+    Raises UsageError if the vehicle's position or yaw is unknown.
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
@@ -111,7 +111,7 @@ def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, fl
 
 
 def _approach(away: float, limit: float, s: WaypointSettings) -> float:
-    """Return the speed at a distance, from the gain, the limit and what still lets the vehicle stop at the goal."""
+    """Return the speed at a distance from the goal, limited so that the vehicle can still stop there."""
     return min(s.gain * away, limit, math.sqrt(2.0 * s.slow_down_m_s2 * away))
 
 
@@ -134,7 +134,7 @@ PositionSource = Callable[[], Fix | None]
 
 
 def fix_of(feedback: Feedback) -> Fix | None:
-    """Return the position reported by the vehicle itself when captured; None if position or yaw is unknown."""
+    """Return the position from a vehicle's own feedback, at its capture time; None if position or yaw is unknown."""
     if feedback.position_m is None or feedback.yaw_rad is None:
         return None
     return Fix(
@@ -146,10 +146,10 @@ def fix_of(feedback: Feedback) -> Fix | None:
 
 
 class DeadReckoning:
-    """Position source that integrates the velocity of a vehicle that reports no position.
+    """A position source that integrates the velocity of vehicles that report no position.
 
-    The position drifts with the error of the velocity. The height is the vehicle's altitude, if it reports one.
-    Feedback is handled on the thread that receives it.
+    Errors of the velocity make the position drift. The height is the vehicle's altitude, if it reports one. Feedback is
+    handled on the thread that receives it.
     """
 
     def __init__(self, drone: Drone, begin: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -165,7 +165,7 @@ class DeadReckoning:
         self._listener = drone.on_feedback(self._take, inline=True)
 
     def __call__(self) -> Fix | None:
-        """Return the newest position; None before the first velocity and yaw."""
+        """Return the newest position; None until the vehicle has reported velocity and yaw."""
         return self._newest
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Motion capture: Vicon, OptiTrack and Qualisys via the ``motioncapture`` package, VRPN, and the simulator's truth."""
+"""Motion capture by Vicon, OptiTrack and Qualisys (package ``motioncapture``), VRPN and the simulator's true poses."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -
     Args:
         address: ``vicon://HOST``, ``optitrack://HOST`` or ``qualisys://HOST`` (extra ``[mocap]``), ``vrpn://HOST``, or
             ``sim://`` for the true poses of simulated drones.
-        bodies: Names of drones, mapped to the names of their bodies in the system: ``{"alpha": "alpha_body"}``. With
-            VRPN, a body is a tracker, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
+        bodies: Names of drones, mapped to the names of their bodies in the system, such as ``{"alpha": "alpha_body"}``.
+            For VRPN, a body is either a tracker, such as ``"Rig"``, or one of its sensors, such as ``"Rig:2"``.
         timeout_s: Maximum time to wait for the first frame [s].
 
     Raises:
-        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none was named.
+        UsageError: An argument is invalid, or a VRPN tracker has several sensors and none was specified.
         UnknownNameError: There is no such system or option.
-        LinkError: No frame arrives within ``timeout_s``.
+        LinkError: No frame arrived within ``timeout_s``.
         MissingExtraError: The extra ``[mocap]`` is not installed.
         UnsupportedError: A simulated drone does not report its true pose.
     """

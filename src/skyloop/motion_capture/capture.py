@@ -1,4 +1,4 @@
-"""Motion capture for applications: the newest pose of each body, callbacks, and calibration."""
+"""Motion capture for applications: newest poses, callbacks and calibration."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 0.05  #: interval between checks for lost bodies
 EVENT_DEPTH: Final = 256  #: maximum number of events waiting for a slow callback
-MAX_UNKNOWN: Final = 1000  #: maximum number of remembered names of unrequested bodies
+MAX_UNKNOWN: Final = 1000  #: maximum number of names to remember for bodies that were not requested
 T = TypeVar("T")
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class TrackEvent:
-    """A change in the tracking of a body, or trouble with the system."""
+    """A change in the tracking of a body, or a problem with the system."""
 
     at_ns: int  #: time on this host's monotonic clock
-    body: str  #: name of the body; empty if the event is about the system
+    body: str  #: name of the body; empty if the event concerns the system
     state: TrackState
     text: str
 
@@ -50,22 +50,22 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
-#: Creates a source from a system, the system's names of the bodies, and callbacks for frames and problems (text).
+#: Function that creates a source, given the system, its names for bodies, and callbacks for frames and problem texts.
 MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callable[[str], None]], Source]
 
 
 class MotionCapture:
-    """Poses of the bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
+    """Poses of bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
 
-    Methods can be called from any thread. Callbacks have their own thread; with ``inline=True`` they run on the
-    receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. An exception in
-    a callback is counted and logged and does not affect other callbacks.
+    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True`` they run on the
+    receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. Exceptions in
+    callbacks are counted and logged and do not affect other callbacks.
 
     Attributes:
         system: The system.
-        bodies: Names of drones, mapped to the system's names of their bodies.
-        latency_ns: Age of a pose on arrival, as given in the address.
-        unknown: Bodies that the system sees but that ``bodies`` does not name.
+        bodies: Names of drones, mapped to the system's names for their bodies.
+        latency_ns: Age of poses on arrival, as specified in the address.
+        unknown: Bodies seen by the system but not named in ``bodies``.
     """
 
     def __init__(self, system: System, bodies: Mapping[str, str], make: MakeSource) -> None:
@@ -73,8 +73,8 @@ class MotionCapture:
 
         Args:
             system: The system.
-            bodies: Names of drones, mapped to the system's names of their bodies.
-            make: Creates the source of frames.
+            bodies: Names of drones, mapped to the system's names for their bodies.
+            make: A function that creates the source of frames.
 
         Raises:
             UsageError: ``bodies`` is empty or maps two names to one body.
@@ -82,17 +82,17 @@ class MotionCapture:
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
             raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
-            raise UsageError(f"bodies is {bodies!r} and must not give one body two names")
+            raise UsageError(f"bodies is {bodies!r} and must not map two names to one body")
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
-        self.unknown: set[str] = set()  #: bodies that the system sees but that ``bodies`` does not name
+        self.unknown: set[str] = set()  #: bodies seen by the system but not named in ``bodies``
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
-        self._troubled = ""  # last reported problem, cleared when a frame arrives
+        self._troubled = ""  # last reported problem; empty once a frame arrives
         self._calibrations: dict[str, Calibration] = {}
-        self._measured: dict[str, list[BodyPose]] = {}  # uncalibrated poses, for a calibration in progress
+        self._measured: dict[str, list[BodyPose]] = {}  # uncalibrated poses for calibrations in progress
         self._poses: Channel[BodyPose] = Channel()
         self._events: Channel[TrackEvent] = Channel()
         self._listeners: list[Listener[Any]] = []
@@ -115,7 +115,7 @@ class MotionCapture:
             return
         self._ended.set()
         self._source.close()
-        if self._watch.ident is not None and self._watch is not threading.current_thread():  # by an inline callback
+        if self._watch.ident is not None and self._watch is not threading.current_thread():  # for inline callbacks
             self._watch.join()
         for listener in list(self._listeners):
             listener.cancel()
@@ -135,21 +135,21 @@ class MotionCapture:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def pose(self, name: str) -> BodyPose | None:
-        """Return the newest pose of a body if it is tracked now; otherwise None, never an old pose.
+        """Return the newest pose of a body if it is currently tracked, otherwise None; never an old pose.
 
         Raises:
-            UnknownNameError: ``bodies`` has no such name.
+            UnknownNameError: ``bodies`` does not contain this name.
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns() - self.latency_ns)  # the checking thread may lag behind
+            track.look(monotonic_ns() - self.latency_ns)  # the watch thread may lag behind
             return track.pose
 
     def state(self, name: str) -> TrackState:
         """Return whether a body is tracked.
 
         Raises:
-            UnknownNameError: ``bodies`` has no such name.
+            UnknownNameError: ``bodies`` does not contain this name.
         """
         return self._track(name).state
 
@@ -161,9 +161,9 @@ class MotionCapture:
             timeout_s: Maximum time to wait [s].
 
         Raises:
-            NoAnswerError: The body was not tracked within that time; the message lists the bodies that the system sees.
-            ClosedError: This motion capture was closed.
-            UnknownNameError: ``bodies`` has no such name.
+            NoAnswerError: The body was not tracked within this time; the message lists the bodies seen by the system.
+            ClosedError: The motion capture has been closed.
+            UnknownNameError: ``bodies`` does not contain this name.
         """
         track = self._track(name)
         with self._changed:
@@ -179,28 +179,28 @@ class MotionCapture:
     def on_pose(self, function: OnPose, *, depth: int = 1, inline: bool = False) -> Listener[BodyPose]:
         """Call ``function`` with the newest pose of any body.
 
-        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`. Call its ``cancel()`` or
-        leave its ``with`` block to stop the calls.
+        Like all ``on_...`` methods of a drone, it returns a :class:`skyloop.client.Listener`. To stop the calls, call
+        its ``cancel()`` or leave its ``with`` block.
 
         Args:
-            function: Called on a separate thread; poses superseded by newer ones are dropped and counted.
-            depth: Number of poses that can wait for the function, for example one per body.
-            inline: Whether to call it on the receiving thread, with every pose. It must be quick and must not block.
+            function: A function called on a separate thread; poses superseded by newer ones are dropped and counted.
+            depth: Maximum number of poses waiting for the function, for example one per body.
+            inline: Whether to call the function with every pose on the receiving thread, which it must not block.
 
         Raises:
-            UsageError: The function can't be called, or ``depth`` is less than 1.
-            ClosedError: This motion capture was closed.
+            UsageError: ``function`` is not callable, or ``depth`` is less than 1.
+            ClosedError: The motion capture has been closed.
         """
         return self._listen(self._poses, function, "pose", depth, inline)
 
     def on_event(self, function: OnEvent, *, inline: bool = False) -> Listener[TrackEvent]:
-        """Call ``function`` whenever a body is found or lost, or there is trouble with the system.
+        """Call ``function`` whenever a body is found or lost, or the system has a problem.
 
-        Returns and raises like :meth:`on_pose`.
+        Return value and exceptions are those of :meth:`on_pose`.
 
         Args:
-            function: Called on a separate thread, for which up to 256 events can wait.
-            inline: Whether to call it on the thread that detected the change instead.
+            function: A function called on a separate thread, for which up to 256 events can wait.
+            inline: Whether to call the function on the thread that detected the change instead.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 
@@ -231,21 +231,21 @@ class MotionCapture:
     # For drones and controllers ---------------------------------------------------------------------------------
 
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
-        """Log a drone's poses on the drone, so that recorders write them and the cockpit shows them.
+        """Log a drone's poses on the drone, so that they are recorded and shown in the cockpit.
 
         Loss of tracking is logged too.
 
         Args:
-            drone: The drone, whose proxy's name must be in ``bodies``.
+            drone: The drone; its proxy's name must be in ``bodies``.
             max_hz: Maximum rate of the logged poses, 1 to 1000.
-            to_vehicle: Whether to also send the poses to the vehicle (:meth:`Drone.send_external_pose`), which may fly
-                by them.
+            to_vehicle: Whether to also send the poses to the vehicle (:meth:`Drone.send_external_pose`), which may use
+                them to fly.
 
         Returns:
-            A context manager. Poses are logged within its block.
+            A context manager; poses are logged within its block.
 
         Raises:
-            UnknownNameError: ``bodies`` has no such name.
+            UnknownNameError: ``bodies`` does not contain this name.
             UsageError: ``max_hz`` is out of range.
         """
         self._track(drone.name)
@@ -255,10 +255,10 @@ class MotionCapture:
         """Return a position source for controllers: ``FollowPath(drone, path, source=capture.source(drone))``.
 
         Raises:
-            UnknownNameError: ``bodies`` has no such name.
+            UnknownNameError: ``bodies`` does not contain this name.
         """
         name = drone.name
-        self._track(name)  # raises here for an unknown name
+        self._track(name)  # raises UnknownNameError here for an unknown name
 
         def newest() -> Fix | None:
             pose = self.pose(name)
@@ -271,24 +271,24 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between the tracked body's axes and the drone's while it rests on the ground.
+        """Measure the rotation between a tracked body's axes and those of a drone that rests on the ground.
 
-        From then on, the body's poses are the drone's. Until then an earlier calibration stays in force.
+        Afterwards, poses of the body are those of the drone. Until then, an earlier calibration remains in force.
 
         Args:
-            drone: The drone, whose proxy's name must be in ``bodies``.
-            heading: Heading of the drone's nose in the world [rad], counter-clockwise from x.
-            seconds: Time to collect poses [s].
+            drone: The drone; its proxy's name must be in ``bodies``.
+            heading: Heading of the drone's nose in world axes [rad], counter-clockwise from x.
+            seconds: Time for collecting poses [s].
 
         Raises:
             UsageError: The drone is flying or moving, or there are too few poses.
             NoAnswerError: The drone is not tracked.
-            ClosedError: This motion capture was closed.
+            ClosedError: The motion capture has been closed.
         """
         name = drone.name
         self.wait(name)
         if drone.feedback().state.airborne:
-            raise UsageError(f"{name} is flying: a calibration needs it at rest on the ground")
+            raise UsageError(f"{name} is flying: land it before calibrating it")
         poses = self._measured[name] = []
         try:
             if self._ended.wait(seconds):
@@ -332,7 +332,7 @@ class MotionCapture:
             self._poses.publish(pose)
 
     def _trouble(self, text: str) -> None:
-        if text != self._troubled:  # a source keeps retrying and failing for the same reason
+        if text != self._troubled:  # a source may keep failing for the same reason
             self._troubled = text
             self._publish_event("", TrackState.LOST, text)
 
@@ -340,11 +340,11 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # a pose that arrives now has this age
+                    track.look(monotonic_ns() - self.latency_ns)  # poses have this age on arrival
                 self._report(track)
 
     def _report(self, track: Track) -> None:
-        """Emit one event for each change in a body's state."""
+        """Publish one event for each change in a body's state."""
         with self._changed:
             before, state = self._reported[track.body], track.state
             self._reported[track.body] = state
@@ -369,14 +369,14 @@ class MotionCapture:
 
 
 def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
-    """Do nothing: the listener's log suffices because motion capture has no events for program errors."""
+    """Do nothing, because motion capture has no events for program errors and the listener logs them."""
 
 
 class Linked:
-    """Logs each of a drone's poses on the drone until closed. See :meth:`MotionCapture.link`."""
+    """Logs all poses of a drone on that drone until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
-        """Initialise. The ``with`` block starts the logging."""
+        """Initialise without logging, which starts with the ``with`` block."""
         if not 1.0 <= max_hz <= 1000.0:
             raise UsageError(f"max_hz is {max_hz!r} and must be from 1 to 1000")
         self._capture = capture
@@ -404,11 +404,11 @@ class Linked:
     def _pose(self, pose: BodyPose) -> None:
         if pose.body != self._drone.name or pose.captured_ns < self._due_ns:
             return
-        # Accept poses a quarter of a period early, because a rate near the system's own would otherwise be halved.
+        # Accept poses a quarter of a period early; otherwise, a rate close to the system's own would be halved.
         self._due_ns = pose.captured_ns + self._period_ns * 3 // 4
         values = (*pose.position_m, *pose.quaternion, *(pose.velocity_m_s or ()))
         at_ns = pose.captured_ns + self._drone.clock_offset_ns
-        if self._to_vehicle:  # first, because the vehicle uses it to fly
+        if self._to_vehicle:  # sent first, because the vehicle uses the pose to fly
             self._drone.send_external_pose(pose.position_m, pose.quaternion, at_ns=at_ns)
         self._drone.log.array(MOCAP, values, at_ns=at_ns)
 

@@ -1,9 +1,9 @@
-"""Poses of bodies from a motion capture system, converted to Skyloop's axes, tracked over time and calibrated. Pure.
+"""Poses from a motion capture system: conversion to Skyloop's axes, tracking over time and calibration. Pure.
 
-The calibration is the rotation between a tracked body's axes, as the system defines them, and the drone's. It follows
-MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if they spread too
-much. The drone's own roll and pitch give its attitude at rest. Its heading comes from how it is placed: with the nose
-along the world's x axis, or as given by ``heading``.
+The calibration is the rotation between a tracked body's axes, as defined by the system, and those of the drone. The
+procedure is that of MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if
+they vary too much. The drone's own roll and pitch determine its attitude at rest. Its nose must point along the world's
+x axis unless ``heading`` is given.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """A body's pose.
+    """The pose of a body.
 
     World axes are those of the capture volume, with z up. Body axes are defined by the system or, after a calibration,
     are those of the drone: x forward, y left, z up (ROS REP 103).
@@ -42,11 +42,11 @@ class BodyPose:
     captured_ns: int  #: capture time on this host's monotonic clock
     position_m: Vector  #: position [m]
     quaternion: Quaternion  #: rotation from body to world axes: x, y, z, w
-    velocity_m_s: Vector | None = None  #: velocity in world axes [m/s]; None until there are enough poses
+    velocity_m_s: Vector | None = None  #: velocity in world axes [m/s]; None before there are enough poses
 
     @property
     def yaw_rad(self) -> float:
-        """Heading of the body's x axis from the world's x axis, counter-clockwise as seen from above [rad]."""
+        """Heading [rad] of the body's x axis relative to the world's x axis, counter-clockwise as seen from above."""
         x, y, z, w = self.quaternion
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -62,7 +62,7 @@ class BodyPose:
 
     @property
     def transform(self) -> RigidTransform:
-        """Pose of the body in the world.
+        """Pose of the body in world axes.
 
         Raises:
             MissingExtraError: SciPy is not installed or too old.
@@ -72,7 +72,7 @@ class BodyPose:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the Hamilton product of quaternions (x, y, z, w): rotate by ``b``, then by ``a``."""
+    """Return the Hamilton product of two quaternions (x, y, z, w): a rotation by ``b``, then by ``a``."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -84,10 +84,10 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
-    """Convert from axes with y up (x right, y up, z backward, Motive's streaming default) to axes with z up.
+    """Convert from axes with y up (x right, y up, z backward, Motive's default for streaming) to axes with z up.
 
-    Rotates both world and body a quarter turn about x, so that an upright body stays upright. Quaternions are x, y, z,
-    w.
+    World and body axes are both rotated by a quarter turn about x, so an upright body stays upright. Quaternions are x,
+    y, z, w.
     """
     x, y, z = position
     qx, qy, qz, qw = quaternion
@@ -95,14 +95,14 @@ def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
 
 
 def plausible(position: Vector, quaternion: Quaternion) -> bool:
-    """Return whether the values can be a pose: finite, and with a quaternion whose length is 1 within 1 %."""
+    """Return whether the values can be a pose: they are finite, and the quaternion's norm is within 1 % of 1."""
     if not all(map(math.isfinite, (*position, *quaternion))):
         return False
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
 
 
 def scipy_types() -> Any:
-    """Import SciPy's module of rotations and transforms, of SciPy 1.16 or newer."""
+    """Import the rotation and transform types of SciPy 1.16 or newer."""
     try:
         from scipy.spatial import transform
 
@@ -112,21 +112,21 @@ def scipy_types() -> Any:
     return transform
 
 
-REST_S: Final = 2.0  #: time to collect poses for a calibration
-MAX_SPREAD_M: Final = 0.005  #: maximum spread of poses at rest: more means motion or poor tracking
-MAX_SPREAD_RAD: Final = math.radians(1.0)  #: maximum spread of their rotations
+REST_S: Final = 2.0  #: time for collecting poses for a calibration
+MAX_SPREAD_M: Final = 0.005  #: maximum spread of positions at rest; more indicates motion or poor tracking
+MAX_SPREAD_RAD: Final = math.radians(1.0)  #: maximum spread of rotations at rest
 MIN_POSES: Final = 20  #: minimum number of poses for a calibration
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Converts the poses of a tracked body to those of the drone."""
+    """Converts poses of a tracked body to poses of the drone."""
 
     turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: rotation from the drone's axes to the tracked body's; x, y, z, w
     spread_m: float = 0.0  #: root mean square distance of the poses from their mean
     spread_rad: float = 0.0  #: root mean square angle between the poses and their mean
-    poses: int = 0  #: number of poses averaged
-    yaw_offset: float | None = None  #: the drone's own yaw minus its heading in the world [rad]; None without a yaw
+    poses: int = 0  #: number of poses that were averaged
+    yaw_offset: float | None = None  #: reported yaw minus heading in world axes [rad]; None without a reported yaw
 
     def apply(self, pose: BodyPose) -> BodyPose:
         """Convert a pose of the tracked body to the drone's pose."""
@@ -147,15 +147,15 @@ def calibrate(
 
     Args:
         poses: At least 20 poses.
-        roll: The drone's reported roll, averaged over the same time [rad]; right side down is positive.
+        roll: The drone's reported roll [rad]; right side down is positive.
         pitch: The drone's reported pitch [rad]; nose down is positive.
         yaw: The drone's reported yaw [rad]; None if it doesn't report one.
-        heading: Heading of the drone's nose in the world [rad], counter-clockwise from x.
+        heading: Heading of the drone's nose in world axes [rad], counter-clockwise from x.
         max_spread_m: Maximum root mean square distance of the poses from their mean.
         max_spread_rad: Maximum root mean square angle between the poses and their mean.
 
     Raises:
-        UsageError: There are too few poses, or they spread beyond the limits because the drone moved or the tracking is
+        UsageError: There are too few poses, or they vary beyond the limits because the drone moved or the tracking is
             poor.
     """
     if len(poses) < MIN_POSES:
@@ -166,7 +166,7 @@ def calibrate(
     spread_rad = math.sqrt(sum(angle * angle for angle in angles) / len(angles))
     if spread_m > max_spread_m or spread_rad > max_spread_rad:
         raise UsageError(
-            f"the poses spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
+            f"the poses spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, but at most "
             f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: keep the drone still"
         )
     stands = quaternion_from_euler(roll, pitch, heading)
@@ -181,9 +181,9 @@ def conjugate(quaternion: Quaternion) -> Quaternion:
 
 
 def mean_quaternion(quaternions: Sequence[Quaternion]) -> Quaternion:
-    """Return the mean rotation, regardless of the signs of the quaternions.
+    """Return the mean rotation, irrespective of the quaternions' signs.
 
-    This is the largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
+    It is the dominant eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
     """
     parts = np.array(quaternions)
     _, vectors = np.linalg.eigh(parts.T @ parts)
@@ -200,30 +200,30 @@ def _spread(places: NDArray[np.float64]) -> float:
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-LOST_AFTER_S: Final = 0.2  #: time without a pose after which a body is lost (ten poses at 50 Hz)
-FROZEN_AFTER_S: Final = 0.5  #: time after which a pose that is identical to the last bit is not a measurement
-WINDOW_S: Final = 0.1  #: time window of poses from which the velocity is computed
-LEAST_POSES: Final = 4  #: minimum number of poses for a velocity
+LOST_AFTER_S: Final = 0.2  #: time without poses after which a body counts as lost (ten poses at 50 Hz)
+FROZEN_AFTER_S: Final = 0.5  #: time after which a bit-identical pose no longer counts as a measurement
+WINDOW_S: Final = 0.1  #: time window for computing the velocity from poses
+LEAST_POSES: Final = 4  #: minimum number of poses for computing a velocity
 
 
 class TrackState(StrEnum):
     """Whether a body's pose is reliable."""
 
-    WAITING = "waiting"  #: not seen yet
+    WAITING = "waiting"  #: the body has not been seen yet
     TRACKED = "tracked"
-    LOST = "lost"  #: seen before, but without new poses
-    ENDED = "ended"  #: the motion capture was closed
+    LOST = "lost"  #: the body was seen before, but there are no new poses
+    ENDED = "ended"  #: the motion capture has been closed
 
 
 class Track:
     """Poses of a body over time.
 
-    The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
-    by half the window and has much less noise than the difference between two poses.
+    The velocity is the slope of a straight line fitted to the positions of the last :data:`WINDOW_S` by least squares.
+    It lags by half the window but has much less noise than the difference between two poses.
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body that has not been seen yet; in a simulator without noise, its pose ``may_freeze``."""
+        """Initialise a body that has not been seen; ``may_freeze`` is for simulators without noise."""
         self.body = body
         self.state = TrackState.WAITING  #: whether the body is tracked
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
@@ -234,7 +234,7 @@ class Track:
         self._last: tuple[Vector, Quaternion] | None = None
 
     def add(self, captured_ns: int, position: Vector, quaternion: Quaternion) -> BodyPose | None:
-        """Update with a new pose [m; x, y, z, w]; return it with its velocity, or None if not new or frozen."""
+        """Update with a pose [m; x, y, z, w]; return it with its velocity, or None if it is frozen or not new."""
         if captured_ns <= self._seen_ns:
             return None
         self._seen_ns = captured_ns
@@ -252,14 +252,14 @@ class Track:
         return self.pose
 
     def look(self, now_ns: int) -> bool:
-        """Update the state for a time [ns]; return whether the body has become lost."""
+        """Update the state at a time [ns]; return whether the body has just been lost."""
         if self.pose is None or now_ns - self.pose.captured_ns < nanoseconds(LOST_AFTER_S):
             return False
         self.state, self.pose = TrackState.LOST, None
         return True
 
     def end(self) -> None:
-        """End the track, because no more poses will arrive."""
+        """End the track because no more poses will arrive."""
         self.state, self.pose = TrackState.ENDED, None
 
     def _velocity(self) -> Vector | None:

@@ -1,8 +1,8 @@
-"""Addresses of motion capture systems, and :func:`main`, the child process that receives from one.
+"""Addresses of motion capture systems, and :func:`main`, which receives data from them in a child process.
 
-The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
-process it can't block anything else and can be killed at any time. Each frame goes to standard output as a msgpack
-array preceded by its length: time of reception, then position and quaternion of each visible body.
+The ``motioncapture`` package waits in native code, without a timeout and partly while holding the interpreter lock. In
+a separate process, it can't block anything else and can be killed at any time. Frames are written to standard output as
+msgpack arrays, each preceded by its length, with the time of reception and the pose of each visible body.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 
-#: System's name in the ``motioncapture`` package and default up axis, by scheme of the address. VRPN has its own client
-#: here.
+#: Name in the ``motioncapture`` package and default up axis of each system, by address scheme. For VRPN, Skyloop has
+#: its own client.
 SYSTEMS: Final = {
     "vicon": ("vicon", "z"),
-    "optitrack": ("optitrack", "y"),  # Motive streams with y up by default
+    "optitrack": ("optitrack", "y"),  # by default, Motive streams data with y up
     "qualisys": ("qualisys", "z"),
     "vrpn": ("vrpn", "z"),
 }
@@ -52,20 +52,20 @@ OPTIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A parsed address of a motion capture system."""
+    """The parsed address of a motion capture system."""
 
     address: str
     kind: str  #: name in the ``motioncapture`` package, or ``sim``
     host: str
     up: str = "z"
     latency_s: float = 0.0
-    settings: tuple[tuple[str, str], ...] = ()  #: additional settings for the package
-    port: int | None = None  #: port after the host in the address
-    sensor: int | None = None  #: sensor for VRPN trackers whose body name gives none
+    settings: tuple[tuple[str, str], ...] = ()  #: additional settings for the ``motioncapture`` package
+    port: int | None = None  #: port that follows the host in the address
+    sensor: int | None = None  #: sensor of VRPN trackers for bodies whose names specify none
 
     @property
     def configuration(self) -> dict[str, str]:
-        """Settings with which the ``motioncapture`` package connects."""
+        """Connection settings for the ``motioncapture`` package."""
         host = self.host if self.port is None else f"{self.host}:{self.port}"
         return {"hostname": host, **dict(self.settings)}
 
@@ -78,7 +78,7 @@ def parse_system(address: str) -> System:
             ``sim://``.
 
     Raises:
-        UsageError: The address is malformed, or an option has a wrong value.
+        UsageError: The address is malformed, or an option has an invalid value.
         UnknownNameError: There is no such system or option.
     """
     parts = urlsplit(address) if isinstance(address, str) else urlsplit("")
@@ -115,7 +115,7 @@ def parse_system(address: str) -> System:
     port = _port_of_host(address, parts)
     if port is not None and kind == "optitrack":
         raise UsageError(f"{address!r}: give the port of OptiTrack's command channel as an option, ?port={port}")
-    if port is not None and kind == "qualisys":  # the package adds its base port
+    if port is not None and kind == "qualisys":  # the package adds this number to its base port
         settings.append(("port", str(port)))
         port = None
     latency_s = _latency(address, options)
@@ -135,7 +135,7 @@ def _latency(address: str, options: dict[str, str]) -> float:
 
 
 def _port_of_host(address: str, parts: SplitResult) -> int | None:
-    """Return the port after the host; None if there is none."""
+    """Return the port that follows the host; None if there is none."""
     try:
         return parts.port
     except ValueError:
@@ -151,20 +151,20 @@ def _port(address: str, options: dict[str, str]) -> str | None:
 
 LENGTH: Final = struct.Struct("<I")
 MAX_FRAME: Final = 1 << 20  #: maximum size of a frame in bytes; enough for thousands of bodies
-MISSING: Final = 3  #: exit code for a missing package
+MISSING: Final = 3  #: exit code if the package is missing
 
 Seen = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 
 class RawFrame(msgspec.Struct, frozen=True, array_like=True):
-    """The bodies that a system sees at a point in time, in the system's own axes."""
+    """The bodies seen by a system at a point in time, in the system's own axes."""
 
-    received_ns: int  #: time of reception, ``time.monotonic_ns`` of this host
+    received_ns: int  #: time of reception on this host's ``time.monotonic_ns`` clock
     bodies: dict[str, Seen]  #: position [m] and quaternion (x, y, z, w) of each tracked body
 
 
 def read(stream: BinaryIO) -> RawFrame | None:
-    """Read the next frame; None at the end of the stream, and ``msgspec.DecodeError`` for anything else."""
+    """Read the next frame; return None at the end of the stream, and raise ``msgspec.DecodeError`` for invalid data."""
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
         return None
@@ -176,7 +176,7 @@ def read(stream: BinaryIO) -> RawFrame | None:
 
 
 def write(stream: BinaryIO, frame: RawFrame) -> None:
-    """Write a frame and flush."""
+    """Write a frame and flush the stream."""
     data = msgspec.msgpack.encode(frame)
     stream.write(LENGTH.pack(len(data)) + data)
     stream.flush()
@@ -193,16 +193,16 @@ def seen(bodies: Any) -> dict[str, Seen]:
 
 
 def open_output() -> BinaryIO:
-    """Reserve standard output for frames and redirect native code's prints to standard error."""
+    """Reserve standard output for frames, and redirect what native code prints to standard error."""
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     return output
 
 
 def main(kind: str, settings: str) -> int:
-    """Connect and write frames until the reader is gone; ``settings`` is a JSON object for the package's ``connect``.
+    """Connect and write frames until the reader is gone; ``settings`` is a JSON object of arguments for ``connect``.
 
-    The exit code is 0 when the reader is gone, :data:`MISSING` if the package is missing, 1 for any other error.
+    Returns 0 once the reader is gone, :data:`MISSING` if the package is missing and 1 after any other error.
     """
     try:
         import motioncapture
@@ -217,22 +217,22 @@ def main(kind: str, settings: str) -> int:
             write(output, RawFrame(time.monotonic_ns(), seen(system.rigidBodies)))
     except BrokenPipeError:
         return 0  # the reader is gone
-    except Exception as error:  # noqa: BLE001  native code may throw anything
+    except Exception as error:  # noqa: BLE001  native code can raise anything
         print(error, file=sys.stderr)
         return 1
 
 
 class TruthSource:
-    """Observes the proxies of simulated drones and reads the true poses from their native telemetry."""
+    """Observes the proxies of simulated drones and reads true poses from their native telemetry."""
 
     def __init__(self, proxies: Iterable[str], take: Callable[[RawFrame], None]) -> None:
-        """Initialise without connecting; ``take`` is called with each frame on the thread that receives feedback."""
+        """Initialise without connecting; ``take`` is called with each frame, on the thread that receives feedback."""
         self._proxies = tuple(proxies)
         self._take = take
         self._open = ExitStack()
 
     def start(self, timeout_s: float) -> None:
-        """Connect to all proxies; UnsupportedError if a vehicle does not report its true pose."""
+        """Connect to all proxies; raise UnsupportedError if a vehicle does not report its true pose."""
         from skyloop.client import connect
 
         with ExitStack() as opening:
@@ -259,7 +259,7 @@ class TruthSource:
 
 
 def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
-    """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None if missing."""
+    """Return the position [m] and quaternion (x, y, z, w) in the simulator's native telemetry; None if missing."""
     native = feedback.native or {}
     try:
         x, y, z, roll, pitch, yaw = (
@@ -271,21 +271,21 @@ def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[flo
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Not ``-m``, because the package imports this module, and Python would warn about that in each child.
+#: Command of the child process. With ``-m``, Python would warn that the package has already imported this module.
 WORKER: Final = (
     sys.executable,
     "-c",
     "import sys; from skyloop.motion_capture.source import main; sys.exit(main(*sys.argv[1:]))",
 )
-AGAIN_S: Final = 0.5  #: delay before restarting a child that ended
-SILENT_S: Final = 3.0  #: time after which a silent child is killed, because its system may have restarted
-FIRST_S: Final = 10.0  #: the same time before a child's first frame
+AGAIN_S: Final = 0.5  #: delay before restarting a child process that ended
+SILENT_S: Final = 3.0  #: time without frames after which a child is killed, because its system may have restarted
+FIRST_S: Final = 10.0  #: the same limit for a child's first frame
 
 
 class ChildSource:
     """Runs :func:`main` in a child process and forwards each frame on a separate thread.
 
-    A child that ends or falls silent is replaced until :meth:`close`.
+    Until :meth:`close` is called, a child that ends or stops sending frames is replaced.
     """
 
     def __init__(
@@ -298,8 +298,8 @@ class ChildSource:
     ) -> None:
         """Initialise without starting the child.
 
-        ``take`` gets each frame on the reading thread, ``trouble`` a description when the child fails. The system's
-        kind and settings are added to the command.
+        ``take`` is called with each frame on the reading thread, and ``trouble`` with a description if the child fails.
+        The system's kind and settings are appended to the command.
         """
         self._system = system
         self._take = take
@@ -307,7 +307,7 @@ class ChildSource:
         self._received_s = 0.0
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._last_words = ""  # end of the last child's output on standard error
+        self._last_words = ""  # end of the last child's standard error output
         settings = msgspec.json.encode(system.configuration).decode()
         self._runner = RestartingChild(
             [*command, system.kind, settings],
@@ -315,17 +315,17 @@ class ChildSource:
             read=self._read,
             ended=self._child_ended,
             started=self._child_started,
-            silent=lambda: time.monotonic() - self._received_s > SILENT_S,  # its native code would wait forever
+            silent=lambda: time.monotonic() - self._received_s > SILENT_S,  # native code would wait forever
             keep_errors=True,
         )
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child; None before the first one."""
+        """Process ID of the current child; None before the first one."""
         return None if self._runner.child is None else self._runner.child.pid
 
     def start(self, timeout_s: float) -> None:
-        """Start the child and wait for the first frame."""
+        """Start the child process and wait for its first frame."""
         self._runner.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
             failed, last_words = self._failed, self._last_words
@@ -333,10 +333,10 @@ class ChildSource:
             raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{last_words}")
 
     def close(self) -> None:
-        """End the child. Idempotent."""
+        """Terminate the child process. Idempotent."""
         child = self._runner.request_stop()
         if child is not None:
-            child.kill()  # the native code does not read its standard input
+            child.kill()  # native code does not read its standard input
         self._runner.stop()
 
     # --- threads ---

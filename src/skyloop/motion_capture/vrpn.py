@@ -1,8 +1,8 @@
-"""VRPN, the Virtual-Reality Peripheral Network, as a source of frames: the protocol, and a client over TCP.
+"""VRPN, the Virtual-Reality Peripheral Network, as a source of frames: protocol decoder and TCP client.
 
-Server and client each send a 24-byte cookie that names the protocol version. Everything after it is a message: a
-24-byte header, then the payload, padded to a multiple of 8 bytes. The length in the header counts the header and the
-payload without its padding. All numbers are big-endian.
+Server and client each send a 24-byte cookie that states the protocol version. Messages follow, each with a 24-byte
+header and a payload padded to a multiple of 8 bytes. The length in the header includes the header and the payload
+without padding. All numbers are big-endian.
 
 ======  =====  ====================================================================================
 offset  type   meaning
@@ -14,12 +14,11 @@ offset  type   meaning
 20      u32    sequence number, for sniffers only
 ======  =====  ====================================================================================
 
-A description (type -1 for a sender, -2 for a type) has the number in the sender field. Its payload is the length of the
-name (u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``.
-Its payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
+A description (type -1 for a sender, -2 for a type) has the number in its sender field. Its payload is the name's length
+(u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``. Its
+payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
 
-
-A client that never sends a UDP port gets everything over TCP.
+A client that never sends a UDP port receives everything over TCP.
 
 Sources: ``Format_Of_Protocol.txt``, ``vrpn_Connection.C`` (``marshall_message``, ``check_vrpn_cookie``) and
 ``vrpn_Tracker.C`` (``encode_to``) of https://github.com/vrpn/vrpn (Boost licence).
@@ -41,13 +40,13 @@ from skyloop.motion_capture.source import RawFrame, Seen, System
 
 DEFAULT_PORT: Final = 3883
 COOKIE_SIZE: Final = 24
-COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: the 0 requests no logging by the server
+COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: the 0 asks the server not to log
 SENDER_DESCRIPTION: Final = -1
 TYPE_DESCRIPTION: Final = -2
 DISCONNECT: Final = -5
 POS_QUAT: Final = "vrpn_Tracker Pos_Quat"
-MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes; the reference implementation's buffer
-MAX_NAMES: Final = 2_000  #: maximum number of senders and of types, as in the reference implementation
+MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes: the buffer size of the reference implementation
+MAX_NAMES: Final = 2_000  #: maximum number of senders and types each, as in the reference implementation
 MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 
 HEADER: Final = struct.Struct(">IIIiiI")
@@ -58,7 +57,7 @@ _SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
 
 @dataclass(frozen=True, slots=True)
 class TrackerPose:
-    """The pose of a tracker's sensor in the server's own axes. Values can be NaN or infinite."""
+    """The pose of a tracker's sensor in the server's own axes, whose values can be NaN or infinite."""
 
     tracker: str
     sensor: int
@@ -67,9 +66,9 @@ class TrackerPose:
 
 
 class Decoder:
-    """Decodes a server's stream, starting with the cookie, in pieces of any size.
+    """Decodes a server's stream, starting with the cookie, from pieces of any size.
 
-    It holds at most one incomplete message and the names that the server has described.
+    The decoder stores at most one incomplete message and the names described by the server.
     """
 
     def __init__(self) -> None:
@@ -78,9 +77,9 @@ class Decoder:
         self._names: dict[int, dict[int, str]] = {SENDER_DESCRIPTION: {}, TYPE_DESCRIPTION: {}}
 
     def feed(self, data: bytes) -> list[TrackerPose]:
-        """Decode the next bytes of the stream; return the poses that they complete, in the order sent.
+        """Decode the next bytes of the stream; return the poses completed by them, in the order sent.
 
-        DecodeError if the bytes are not VRPN or the server ends the connection. The decoder is unusable afterwards.
+        Raises DecodeError if the data is not VRPN or the server ends the connection; the decoder is then unusable.
         """
         self._pending += data
         if not self._greeted:
@@ -141,27 +140,27 @@ def _decode_name(payload: bytes) -> str:
 
 
 CONNECT_S: Final = 1.0  #: maximum time for a server to accept a connection
-AGAIN_S: Final = 0.5  #: delay before the next attempt to connect
-SILENT_S: Final = 3.0  #: time without a pose after which a connection is dropped: the server may have restarted
-SETTLE_S: Final = 0.3  #: time to wait for a tracker's other sensors before using its sensor 0 for the body
-POLL_S: Final = 0.1  #: interval at which an idle reader checks whether to end
-CHUNK: Final = 65_536  #: maximum number of bytes received at a time
-MAX_SENSORS: Final = 1_000  #: maximum number of sensors remembered per tracker
+AGAIN_S: Final = 0.5  #: delay before trying to connect again
+SILENT_S: Final = 3.0  #: time without poses after which a connection is dropped, because the server may have restarted
+SETTLE_S: Final = 0.3  #: time to wait for other sensors of a tracker before using its sensor 0
+POLL_S: Final = 0.1  #: interval at which an idle reader checks whether to stop
+CHUNK: Final = 65_536  #: maximum number of bytes to receive at once
+MAX_SENSORS: Final = 1_000  #: maximum number of sensors to remember per tracker
 
 
 class SensorSelection:
-    """Decides which tracker's sensor belongs to which body. Pure: the time is an argument.
+    """Decides which sensor of which tracker belongs to which body. Pure; the time is passed in.
 
-    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor given in the address. If neither gives one,
-    sensor 0 is used as long as no other sensor of that tracker has ever reported. Otherwise the choice is ambiguous and
-    the body has no pose.
+    The name of a body is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor specified in the address. If neither
+    specifies a sensor, sensor 0 is used as long as no other sensor of that tracker has reported. Otherwise the choice
+    is ambiguous, and the body has no pose.
     """
 
     def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
-        """Initialise the selection; ``sensor`` is that of bodies whose name gives none."""
+        """Initialise the selection; ``sensor`` is used for bodies whose names specify none."""
         self._bodies: dict[tuple[str, int], str] = {}
-        self._unnamed: set[str] = set()  # trackers whose sensor is not named
-        self._reported: dict[str, tuple[int, set[int]]] = {}  # their first report and the sensors seen
+        self._unnamed: set[str] = set()  # trackers without a specified sensor
+        self._reported: dict[str, tuple[int, set[int]]] = {}  # time of the first report and sensors seen
         for name in names:
             tracker, named = split_name(name)
             number = sensor if named is None else named
@@ -175,7 +174,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest of some poses in order of arrival for each body; of others by ``TRACKER:SENSOR``."""
+        """Return the newest pose of each body, given poses in order of arrival; others are named ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
@@ -187,7 +186,7 @@ class SensorSelection:
             name = self._bodies.get((pose.tracker, pose.sensor))
             if name is None:
                 name = f"{pose.tracker}:{pose.sensor}"
-                if name in self._wanted:  # the name collides with another body's
+                if name in self._wanted:  # the name collides with that of another body
                     continue
             elif name in self._unnamed and not self._certain(name, now_ns):
                 continue
@@ -195,12 +194,12 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Return whether it is known, for every reporting tracker, if its sensor must be named."""
+        """Return whether all reporting trackers have had time to show if they have several sensors."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property
     def refused(self) -> dict[str, str]:
-        """Return the trackers whose sensor must be named but isn't, with the reason and a remedy."""
+        """Return the trackers whose sensor must be specified but isn't, with the reason and a remedy."""
         return {
             tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and the body's is not named: name it "
             f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
@@ -214,31 +213,31 @@ class SensorSelection:
 
 
 class VrpnSource:
-    """Receives from a VRPN server and forwards each frame on a separate thread.
+    """Receives data from a VRPN server and forwards each frame on a separate thread.
 
-    A connection that ends, falls silent or carries data other than VRPN is replaced until :meth:`close`. A backlog in
-    the socket counts as one frame with the newest pose of each body.
+    Until :meth:`close` is called, a connection that ends, stops delivering poses or delivers data other than VRPN is
+    replaced. A backlog in the socket counts as one frame with the newest pose of each body.
     """
 
     def __init__(
         self, system: System, names: Iterable[str], take: Callable[[RawFrame], None], trouble: Callable[[str], None]
     ) -> None:
-        """Initialise without connecting; names are ``TRACKER`` or ``TRACKER:SENSOR``.
+        """Initialise without connecting; ``names`` have the form ``TRACKER`` or ``TRACKER:SENSOR``.
 
-        ``take`` gets each frame and ``trouble`` a description of each problem, on the reading thread.
+        On the reading thread, ``take`` is called with each frame and ``trouble`` with a description of each problem.
         """
         self._system = system
         self._selection = SensorSelection(names, system.sensor)
         self._take = take
         self._trouble = trouble
-        self._refused: dict[str, str] = {}  # copy of the selection's refused trackers for other threads
+        self._refused: dict[str, str] = {}  # copy of the refused trackers for use by other threads
         self._failure = ""  # why the last connection ended
         self._ended = threading.Event()
-        self._ready = threading.Event()  # set once poses arrive or are refused
+        self._ready = threading.Event()  # set once poses have arrived or been refused
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Connect and wait for the first frame; UsageError if a tracker has several sensors and none was named."""
+        """Connect and wait for the first frame; raise UsageError if the choice of a tracker's sensor is ambiguous."""
         self._reader.start()
         ready = self._ready.wait(timeout_s)
         if ready and not self._refused:
@@ -252,7 +251,7 @@ class VrpnSource:
         """Close the connection. Idempotent."""
         self._ended.set()
         if self._reader.ident is not None and self._reader is not threading.current_thread():
-            self._reader.join(CONNECT_S + 1.0)  # a name lookup may take longer, but it ends
+            self._reader.join(CONNECT_S + 1.0)  # name lookups may take longer, but they do end
 
     # --- reader thread ---
 
@@ -267,7 +266,7 @@ class VrpnSource:
             self._ended.wait(AGAIN_S)
 
     def _receive(self) -> None:
-        """Run one connection from start to end."""
+        """Receive over one connection, from its start to its end."""
         address = self._system.host, self._system.port or DEFAULT_PORT
         with socket.create_connection(address, CONNECT_S) as connection:
             connection.settimeout(POLL_S)
@@ -281,7 +280,7 @@ class VrpnSource:
                     data = connection.recv(CHUNK)
                 except TimeoutError:
                     continue
-                except ConnectionResetError:  # a server that exits with unread data resets the connection
+                except ConnectionResetError:  # servers that exit with unread data reset the connection
                     data = b""
                 received_ns = monotonic_ns()
                 if not data:
@@ -303,7 +302,7 @@ class VrpnSource:
 
 
 def split_name(name: str) -> tuple[str, int | None]:
-    """Split a body's name into tracker and sensor. The sensor is None unless a number follows a colon."""
+    """Split a body's name into tracker and sensor; the sensor is None unless the name ends in a colon and a number."""
     tracker, _, number = name.rpartition(":")
     if tracker and number.isascii() and number.isdigit() and len(number) <= 9:
         return tracker, int(number)
