@@ -189,7 +189,7 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks."""
+        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks it."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
@@ -216,7 +216,7 @@ class Host:
         """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
 
         ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
-        does Ctrl-C if nothing else handles it; it is raised at the end.
+        does Ctrl-C if nothing else handles it; ``KeyboardInterrupt`` is then raised at the end.
         """
         with self._lock:
             self._closing = True

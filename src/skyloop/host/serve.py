@@ -81,7 +81,7 @@ def serve(
         polls = _key_changes(fleet)
         gc.collect()
         gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
-        # Poll, because the kernel may deliver a signal to any thread, which does not wake this one.
+        # Poll, because the kernel may deliver a signal to another thread, and that does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -153,7 +153,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
     """Return a source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # a folder that could not be served
+        with suppress(UsageError, ImportError):  # a folder whose vehicle could not be served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll

@@ -26,7 +26,7 @@ MAX_FAILURES: Final = 25
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called on the ticker's thread with a proxy whose ticks fail and the last error; must return immediately.
+#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing; must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
 MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
 IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
@@ -58,7 +58,7 @@ class Ticker:
         self._thread.start()
 
     def add(self, proxy: Proxy) -> None:
-        """Tick a proxy from now on. Any thread."""
+        """Start ticking a proxy. Any thread."""
         with self._lock:
             self._failures[proxy] = 0
 
@@ -90,7 +90,7 @@ class Ticker:
         for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
-            for place, proxy in enumerate(proxies, rounds):  # a fifth of them per round, to spread the work
+            for place, proxy in enumerate(proxies, rounds):  # a fifth of the sockets per round, to spread the work
                 failures = self._failures.get(proxy)
                 if failures is not None:  # no other ticker has taken it over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
@@ -254,7 +254,7 @@ class Watchdog:
         self._loops = loops
         self._on_stall = on_stall
         self._on_hang = on_hang
-        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and number of checks without a change
+        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # number of entries, and number of checks without a change
         self._checked_s = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-watchdog", daemon=True)
@@ -283,7 +283,7 @@ class Watchdog:
                 act = self._on_stall if checks == STALL_CHECKS else self._on_hang
                 try:
                     act(loop, inside)
-                except Exception:  # noqa: BLE001  it must keep checking
+                except Exception:  # noqa: BLE001 the checks must continue
                     _log.exception("handling a vehicle that hangs failed")
         self._seen = seen
 
@@ -295,9 +295,9 @@ class Watchdog:
 class LinkThread:
     """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
 
-    One thread for all, because with a thread for each, most time would go to switching threads. Commands bypass it:
-    they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows
-    whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
+    One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
+    it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
+    shows whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
@@ -380,7 +380,7 @@ class LinkThread:
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
-            del self._due_ns[link]  # until it has been served
+            del self._due_ns[link]  # absent until it has been served
             due.add(link)
         return due
 

@@ -199,7 +199,7 @@ class SharedVehicle(HostedVehicle):
         self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         if self.condition is not Condition.STOPPED:
-            self._settled.wait(OPEN_S + 1.0)  # otherwise it might start to serve after its removal
+            self._settled.wait(OPEN_S + 1.0)  # otherwise it might start serving after its removal
         proxy = self.proxy
         if proxy is not None and self.condition is Condition.RUNNING:
             patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)
@@ -243,7 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run something that may hang on a separate thread, and raise its exceptions here.
 
-    Returns whether the call returned in time. If not, its daemon thread keeps running.
+    Returns whether the call returned in time. If it did not, its daemon thread keeps running.
     """
     raised: list[BaseException] = []
 

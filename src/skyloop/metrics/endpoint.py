@@ -103,7 +103,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
         Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
         Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),
-        # For the cockpit, as a client of each proxy.
+        # Metrics of the cockpit, which is a client of each proxy.
         Family(
             "skyloop_client_link_state",
             "gauge",
@@ -134,7 +134,7 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: at a time; a further connection closes the one that has waited longest without a request
+MAX_SCRAPES: Final = 8  #: at the same time; another connection closes the one that has waited longest without a request
 ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop
@@ -315,7 +315,7 @@ class _Server(ThreadingHTTPServer):
             with self._lock:
                 self._open.pop(request, None)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  (as it is called)
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002 (the base class's signature)
         _log.debug("a scrape by %s ended early", client_address, exc_info=True)
 
 

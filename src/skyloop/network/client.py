@@ -234,7 +234,7 @@ class FabricClient(TransportClient):
         self._run = ""  # the proxy's run, set once a proxy was asked to admit us
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with the declarations for each
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each with its declarations
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None

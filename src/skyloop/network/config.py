@@ -28,10 +28,11 @@ DEFAULT_PORT: Final = 7447  #: Zenoh's default port
 OPEN_MS: Final = 800
 #: The same for addresses given explicitly: all are tried at once, and one may lead to a mobile network, where answers
 #: after an outage are stuck behind old video. An end that gives up just before the last answer leaves a half-open link
-#: at the far end; Zenoh takes the next link for a second one to the same peer and does not repeat declarations on it.
+#: at the far end; Zenoh mistakes the next link for a second one to the same peer and does not repeat declarations on
+#: it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits to discover others (Zenoh's default). An application that has one address waits only
-#: for its proxy; one that has several must find all proxies with the name.
+#: How long opening a session waits to discover others (Zenoh's default). An application with a single address waits
+#: only for the proxy at that address; one with several must find every proxy with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
 #: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
@@ -77,7 +78,7 @@ class FabricSettings:
     who: str = ANYONE  #: the identity: the certificate's common name
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
     access_control: dict[str, Any] | None = None
-    #: The keys that ``tls`` and ``access_control`` were made from.
+    #: The keys from which ``tls`` and ``access_control`` were made.
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
@@ -244,7 +245,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
     # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long, because one of Zenoh's few
-    # receiving threads waits for it meanwhile. All other messages are dropped when a link is congested.
+    # receiving threads is blocked in the meantime. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP

@@ -72,7 +72,7 @@ class ServerConnection:
     def took(self, topic: str, number: int, now_s: float) -> bool:
         """Record up to which packet of a topic, or (if empty) of those to this application only, it has acknowledged.
 
-        Returns whether further packets sent to this application only may be due.
+        Returns whether further packets that go only to this application may be due.
         """
         with self.lock:
             if not topic:
@@ -201,7 +201,8 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing.
 
-        Publishers are not undeclared, which would fail while another thread uses one; each ends with its last user.
+        Publishers are not undeclared, because that would fail while another thread uses one; each ends with its last
+        user.
         """
         with self._lock:
             self._session = None
@@ -293,7 +294,7 @@ class Publisher:
             self._subscribed.pop(topic, None)
             if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # it ends with its last user
+                self._publishers.pop(topic, None)  # freed once its last user drops it
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         newest_wins = layout.newest_wins(topic)

@@ -168,7 +168,7 @@ class Pace:
         self._newest = self._acknowledged = 0  # packet numbers
         self._eager = False  # it acknowledges more often than required, so its silence is significant
         self._sent_s = -math.inf  # when the newest packet was sent
-        self._since_s = math.inf  # when the oldest unacknowledged packet was sent, or later
+        self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
     def may_send(self, now_s: float) -> bool:
         """Return whether another packet may be sent now."""

@@ -24,8 +24,8 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: number of frames in flight to one reader
-#: Forms of one camera's frames. Each is encoded separately; the n parts of one form together cost no more than one. The
-#: default forms are not counted, which leaves room for a pilot whatever others request.
+#: Forms of one camera's frames. Each form is encoded separately; a form split into n parts costs no more than a whole
+#: one. The default forms are not counted, which leaves room for a pilot whatever others request.
 MAX_FORMS: Final = 32
 MAX_FORMS_EACH: Final = 8  #: number of forms that one connection may read
 #: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
@@ -105,7 +105,7 @@ class FramePublisher:
         self._unable: set[str] = set()  # topics whose encoding failed and has been logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that miss it, having :data:`WINDOW` frames in flight.
+        """Publish a frame; return the number of readers that miss it because they have :data:`WINDOW` frames in flight.
 
         If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
         """
@@ -244,7 +244,7 @@ class FramePublisher:
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
-        """Wait for a variant with readers due for its newest frame; return all three (readers None: all).
+        """Wait until a variant has readers due for its newest frame; return all three (readers None: all of them).
 
         None at the end, or if the camera has no readers.
         """

@@ -49,7 +49,7 @@ ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinPr
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
 _REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole head, because garbage must keep its order
-_POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may rely on it to fly
+_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need these to fly
 
 
 class Sender(NamedTuple):
@@ -105,7 +105,7 @@ def newest_wins(topic_name: str) -> bool:
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key for frames of a variant, which is the part after the ``?`` in their topic."""
+    """Return the key for a variant's frames; the variant is the part after the ``?`` in their topic."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 

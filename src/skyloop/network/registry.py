@@ -79,9 +79,9 @@ class ConnectionRegistry:
         self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
         self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
         self.turned_away = 0  #: number of connections and tokens refused because of the limits
-        self._away = ""  # why, until the handler has been notified
+        self._away = ""  # why they were turned away, until the handler has been notified
         self.strays = 0  #: number of samples and queries without a connection
-        self._stray_commands = 0  # commands and requests among them, not reported to the handler yet
+        self._stray_commands = 0  # number of commands and requests among them, not yet reported to the handler
 
     def open(self) -> None:
         """Start admitting applications."""

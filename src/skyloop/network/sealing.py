@@ -34,7 +34,7 @@ SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """Seal and opener for use without keys: changes nothing."""
+    """Seal and opener for use without keys; they change nothing."""
 
     tag = trailer = 0
 

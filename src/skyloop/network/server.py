@@ -29,7 +29,7 @@ from skyloop.transport.priority import SUPERSEDED, is_command
 if TYPE_CHECKING:
     import zenoh
 
-FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
+FAREWELL_S: Final = 0.5  #: time that applications get to receive the reason when a transport server stops
 _POLL_S: Final = 0.5  # interval between checks of the connections
 _REFUSED: Final = b""  # represents a refused packet
 _COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
@@ -249,7 +249,7 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # otherwise it takes the previous one's turn
+        if not superseded:  # otherwise the packet takes the turn of the one it replaces
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:

@@ -81,7 +81,7 @@ class Session:
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
     def over(self, now: float) -> bool:
-        """Return whether it has been unused for long enough. For use by the pool."""
+        """Return whether the session has been unused for long enough to close it. For use by the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
@@ -161,8 +161,8 @@ class _Pool:
         """Close all sessions when the process ends.
 
         Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh: on
-        returning to Python it would be ended by an exception that can't pass through native code, which aborts the
-        process ("FATAL: exception not rethrown").
+        returning to Python, such a thread would be ended by an exception that can't pass through native code, which
+        aborts the process ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -231,7 +231,7 @@ def host_name() -> str:
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session that has no other users by one at the same addresses with the newest roster.
+    """Replace a session that has no other users with one at the same addresses that uses the newest roster.
 
     All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
     not become free again within :data:`REOPEN_S`.

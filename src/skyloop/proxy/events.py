@@ -1,7 +1,7 @@
 """What a proxy reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, followed by its input: event drafts, which pure functions create, first about commands,
-failsafe and ownership, then about the authority.
+The publisher comes first, followed by the pure functions that create its input, the event drafts: those about commands,
+failsafe and ownership, then those about the authority.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class EventPublisher:
                 self._missed = 0  # if this event itself gets lost, no further one reports that
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
-        """Number events and publish them. The lock is held."""
+        """Number events and publish them. The caller holds the lock."""
         scrub, packets = self._scrub, []
         told = [
             (one, scrub(one.text), {key: scrub(it) if isinstance(it, str) else it for key, it in one.data.items()})
@@ -239,7 +239,7 @@ def thin_zones_event(space: Space) -> EventDraft:
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event for a position that changed by more than flying can explain; ``lands``: it was landing."""
+    """Return the event for a position that changed by more than flying explains, ``lands``: during a landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
@@ -300,7 +300,7 @@ def ownership_event(changed: Changed) -> EventDraft:
 
 
 def slept_event(slept_s: float) -> EventDraft:
-    """Return the event for a sleep of this computer [s]."""
+    """Return the event that reports how long this computer slept [s]."""
     text = f"this computer slept for {slept_s:.1f} s: earlier commands are no longer executed"
     data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)

@@ -141,7 +141,7 @@ class ActionExecutor:
         return True
 
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
-        """Hover or land without a pilot; return whether it was accepted. Failures are published, not raised."""
+        """Hover or land without a pilot; return whether it was accepted. Failures are published rather than raised."""
         if type(action) in self.native:
             taken = False
             try:
@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently: no further commands are sent.
 
-        If the vehicle has no hover of its own, it is brought to a standstill as well as a single set-point can do it.
+        A vehicle without a hover of its own is also brought to a standstill, as well as a single set-point can.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -172,7 +172,7 @@ class ActionExecutor:
         last: Velocity | Attitude = Velocity() if Velocity in self.native else Attitude()
         try:
             self._driver.apply(last)
-        except Exception as error:  # noqa: BLE001  it is reported; nothing else helps
+        except Exception as error:  # noqa: BLE001 it is reported, and nothing more can be done
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
@@ -207,8 +207,8 @@ class ReturnSupervisor:
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._problem = ""  # why the ladder's return can't continue
-        self._good_ns = 0  # when it could last continue
+        self._problem = ""  # why the ladder's return flight can't continue
+        self._good_ns = 0  # when the return was last able to continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
         """Start the ladder's return; :meth:`update` continues it."""
@@ -236,7 +236,7 @@ class ReturnSupervisor:
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't fly back to the start; empty if it can, or need not."""
+        """Return why the ladder can't fly back to the start; empty if it can, or does not need to."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem

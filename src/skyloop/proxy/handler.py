@@ -50,7 +50,7 @@ from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
-#: Echo of a command without a new effect, because it was refused or held.
+#: Echo of a command that had no new effect because it was refused or held.
 _NOTHING: Final = Idle()
 
 
@@ -216,15 +216,16 @@ class CommandHandler(FlightSupervisor):
                 applied, applied_ns = self._obey(session, command, now_ns)
         self._counts["commands.received"] += 1
         if self._subscribers(COMMANDS):
-            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # limits of that field in the echo
+            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # within the limits of that field in the echo
             action, app_id = command.action, session.app_id
             echo = Applied(command.seq, command.lease, app_id, sent_ns, applied_ns, action, applied)
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Return what was applied and when; for a refused command, when it was received."""
-        # On a machine that was idle, as it usually was before a command, each function call costs microseconds. So
-        # ordinary commands are received, decided and executed here, while error messages are written elsewhere.
+        # On a machine that was idle, which is usual before a command, each function call costs microseconds. Ordinary
+        # commands are therefore received, judged and executed in this module, while error messages are written
+        # elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
@@ -256,7 +257,7 @@ class CommandHandler(FlightSupervisor):
             return _NOTHING, self._count_applied(command)
         if intent.over:
             self._report_intent(session)
-            if intent.reason is None:  # it was carried out
+            if intent.reason is None:  # the intent was executed
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
@@ -305,7 +306,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after a new command by an application, or if no others are flying the vehicle."""
+        """Make the flight ours after a new command from an application, or if nobody else is flying the vehicle."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -335,11 +336,11 @@ class CommandHandler(FlightSupervisor):
             return self._refuse(session, command, Refusal.UNSUPPORTED, why), now_ns
         try:
             applied = self._executor.execute(command.action, now_ns)
-        except Exception as error:  # noqa: BLE001  it is reported, and the repeats retry
+        except Exception as error:  # noqa: BLE001 it is reported, and the repeats try again
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # a stop's repeats count as a sign of life: nothing else is sent
+            self.authority.last_command_ns = now_ns  # repeats of a stop count as signs of life: nothing else is sent
         self._rising_until_ns = None  # only the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None

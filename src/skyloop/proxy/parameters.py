@@ -47,7 +47,8 @@ from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 MAX_TEXT: Final = 1024  #: characters in a text value
 MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
+#: A momentary parameter, such as a flip, is written within this time or not at all, because its writer waits no longer
+#: than that.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -170,7 +171,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number to write, alone or in a vector: finite and within the range."""
+    """Return a number to write, alone or in a vector, checked to be finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -265,7 +266,7 @@ class Parameters:
         self._presets: dict[str, Value] = {}  # presets not yet written to the driver
         self.left_out: tuple[str, ...] = ()  #: names of the driver's parameters that are too large to send
         self._in_force: dict[str, Any] = {}  # values of the proxy's own parameters
-        self._changed: set[str] = set()  # first parts of the names of parameters that the settings don't reflect yet
+        self._changed: set[str] = set()  # prefixes of the names of parameters that the settings don't reflect yet
         self._settings = FlightSettings()
         self._apply(OWN)
 
@@ -312,7 +313,7 @@ class Parameters:
         return value
 
     def _apply(self, parameters: Iterable[Parameter]) -> None:
-        """Apply values of the proxy's own parameters, and record which have changed. The lock is held."""
+        """Apply values of the proxy's own parameters, and record which have changed. The caller holds the lock."""
         for standard in parameters:
             name, kind = standard.name, standard.type
             own = self._own[name].value
@@ -368,8 +369,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. As they also change without being written, each
-    is always read again, and changes cause no event.
+    ``free``: parameters that any pilot may write without the authority. Because these also change without being
+    written, each is read again every time, and changes cause no event.
     """
 
     def __init__(

@@ -141,7 +141,7 @@ class VehiclePublisher:
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Set the outcome of an intent in feedback; if it has ended, that is published by the next tick."""
+        """Set the outcome of an intent in feedback; if the intent has ended, the next tick publishes the outcome."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
@@ -349,7 +349,7 @@ class VehiclePublisher:
             before, self.link_state = self.link_state, state
             self.link_reason, self.link_remedy = reason, remedy
             was_up, self.link_up = self.link_up, state in _LINK_UP
-            if was_up != self.link_up and (was_up or self.link_breaks):  # except when it comes up for the first time
+            if was_up != self.link_up and (was_up or self.link_breaks):  # not counting the first time that it comes up
                 self.link_breaks += 1
             self._published_ns = -KEEP_ALIVE_NS  # published in feedback at the next tick
         if same:

@@ -207,7 +207,7 @@ def record_path(name: str) -> Path:
 
 
 class FlightRecord:
-    """The file of one proxy, written in its own thread from :meth:`start` to :meth:`close`.
+    """The file with one proxy's flight record, written on its own thread from :meth:`start` to :meth:`close`.
 
     ``vehicle``: the vehicle's address, as notes about other vehicles are ignored; ``wall``: the wall clock [s].
     """
@@ -245,7 +245,7 @@ class FlightRecord:
             self._changed.set()
 
     def close(self) -> None:
-        """Write the final state. The note stays if the vehicle is left in the air, for the next run to end this."""
+        """Write the final state. The note stays if the vehicle is left in the air, so that the next run can end it."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._closing = True

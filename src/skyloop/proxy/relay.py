@@ -181,7 +181,7 @@ class ProcessorWorkers:
     def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
         """Relay a result to its subscribers, marked with the number of the sending application.
 
-        Returns why it is malformed, or an empty text. A refused result is counted, and published as an event.
+        Returns why it is malformed, or an empty string. A refused result is counted, and published as an event.
         """
         if session.role is None:
             return "a result arrived before Hello"
@@ -277,7 +277,7 @@ class WorkerRoster:
         return [self._workers.pop(key).asked for key in keys]
 
     def joined(self, app_id: int) -> int:
-        """Return the number of processors that it works for."""
+        """Return the number of processors that the application works for."""
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:

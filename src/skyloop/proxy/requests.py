@@ -119,7 +119,7 @@ class JobQueue(Protocol):
         """Queue a job, which must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """End after the current job; if that hangs for longer, it is left to its daemon thread."""
+        """Stop after the current job; if that takes longer than this, leave it to its daemon thread."""
 
 
 class JobThread:
@@ -185,7 +185,7 @@ class RequestDispatcher:
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Run a job, which must not raise, on the thread of requests, after those already waiting."""
+        """Run a job, which must not raise, on the requests thread, after those already waiting."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:

@@ -26,7 +26,7 @@ from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing after its program has gone
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
 _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; waiting is printed only afterwards
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
@@ -80,7 +80,7 @@ class Shutdown:
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
-        """Request the end. Thread-safe, also for signal handlers."""
+        """Request that the process end. Thread-safe, also for signal handlers."""
         if hurry or self.requested.is_set():  # a second signal means to end at once
             self.hurry.set()
         self.reason = self.reason or reason

@@ -1,8 +1,8 @@
 """Encode H.264 as subscribers request it: each form once, in its own thread, for all of its subscribers.
 
-A form with a fixed rate is shared by all that request it. A form with a subscriber's name is for that subscriber alone;
-its rate and size are adapted to the path, judging by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a form forwards it unchanged while the path can carry it, and otherwise encodes.
+A form with a fixed rate is shared by all that request it. A form named after a subscriber is for that subscriber alone;
+its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle
+itself sends H.264, such a form forwards it unchanged while the path can carry it, and otherwise encodes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # highest rate tried for them [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
-_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without a picture for this long, the vehicle has stopped
+_OWN_SILENT_NS: Final = nanoseconds(1.0)  # if no picture arrives for this long, the vehicle has stopped sending
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own pictures may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether they are being forwarded while they arrive
+        self._passing = False  # whether they are being forwarded, as long as they keep arriving
         self._own_ns = 0  # when the newest of them arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
@@ -112,7 +112,7 @@ class StreamForm:
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
-        """Switch back to encoding, starting with a key picture. The lock is held."""
+        """Switch back to encoding, starting with a key picture. The caller holds the lock."""
         self._passing, self._wants_key, self._needs_encoder = False, True, True
 
     def asked(self) -> None:
@@ -158,7 +158,7 @@ class StreamForm:
                 self._rate.acknowledged(report.seq, now_ns)
 
     def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
-        """Handle a whole picture encoded by the vehicle; return it ready to publish, or None to drop it."""
+        """Handle a complete picture encoded by the vehicle; return it ready to publish, or None to drop it."""
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
@@ -169,7 +169,7 @@ class StreamForm:
             fits = rate.may_send(now_ns)
             # Each picture refers to the previous one; after skipping one, encode until the vehicle's next key picture.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
-                if not self._wants_key:  # it was too much for the path
+                if not self._wants_key:  # the pictures overloaded the path
                     self._try_ns = now_ns + self._again_ns
                     self._again_ns = min(2 * self._again_ns, _TRY_AT_MOST_NS)
                 self._encode_again()
@@ -314,13 +314,13 @@ class Streams(Forms[StreamForm]):
         return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
-        """Return whether a form may forward the vehicle's own pictures of this camera."""
+        """Return whether any form may forward the vehicle's own pictures from this camera."""
         return any(
             one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in self.known
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame in the forms that need it, copying it once if there are any."""
+        """Queue a frame for the forms that need it, copying it once if any do."""
         camera = header.camera
         wanted = [
             form

@@ -215,7 +215,8 @@ class OverviewPublisher:
     def share(self, registry: OverviewRegistry) -> None:
         """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy but not another, as they would see the others' rows.
+        Does nothing if applications may have access to one proxy but not another, because they would see the others'
+        rows.
         """
         if not self._server.restricted:
             self.registry = registry

@@ -35,7 +35,7 @@ COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: log entries of applications (LogEntry)
 OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
-MAX_TOPIC = 200  #: characters in a topic's name
+MAX_TOPIC = 200  #: maximum number of characters in a topic's name
 MAX_SUBSCRIPTIONS = 64  #: maximum number of simultaneous topics per connection
 RESULTS = "results"  #: results of all processors (ProcessorResult)
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: maximum size of a packet [bytes]
@@ -77,13 +77,13 @@ class ServerHandler(Protocol):
     """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, before its first packet. An equal peer identifies it in all later calls."""
+        """Handle a new connection, before its first packet. Later calls identify it by an equal ``Peer``."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle a packet that was not delivered because the sender's keys forbid it; :data:`NOBODY`: unknown."""
+        """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
 
     def topic_problem(self, topic: str) -> str:
         """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.

@@ -12,7 +12,7 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, nearest first, and has its own numbers for their peers.
+    """One transport server that combines several, nearest first, and gives their peers numbers of its own.
 
     The handler gets one call at a time, as the contract requires: an end that brings a command goes first, the others
     in order of arrival.

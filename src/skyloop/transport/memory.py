@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-#: A client, and what its server's receiving thread has to tell the handler.
+#: A client, and a call to the handler that the server's receiving thread makes on its behalf.
 _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 

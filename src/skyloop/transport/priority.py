@@ -43,7 +43,7 @@ class Lane(IntEnum):
 
 
 class PacketBacklog:
-    """Holds the waiting packets of one connection, at most ``most``. Not thread-safe."""
+    """Holds up to ``most`` waiting packets from one connection. Not thread-safe."""
 
     __slots__ = ("_bytes", "_idle", "_last", "_most", "_number", "_set_point", "_waiting")
 
@@ -52,7 +52,7 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may be gone
+        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may have been removed
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -111,7 +111,7 @@ class PacketBacklog:
     def _drop(self, number: int, newer: Command) -> int:
         """Drop an older command if it is still waiting; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # because a network may reorder packets
+        if older is None or older.seq >= newer.seq:  # a network may have reordered them
             return 0
         self._take(number)
         return 1

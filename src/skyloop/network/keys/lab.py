@@ -56,7 +56,7 @@ IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
-FOLDER: Final = "pages"  #: name of the folder for pages within the lab's folder
+FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
 
 PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
 RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left

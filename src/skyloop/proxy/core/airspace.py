@@ -24,11 +24,11 @@ from skyloop.zones import Space, Vec3, Wall, Zone
 GRAVITY_M_S2: Final = 9.80665
 LOST_NS: Final = 2 * NS_PER_S  #: age of a position beyond which it is not worth waiting for the next
 BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
-#: A position has jumped if it changes by more than this, and by more than the vehicle can have flown.
+#: A position has jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further beyond, only coming back is allowed
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; any further out, only moving back is allowed
 BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed at which a vehicle is led back if it requests to fly on beyond a wall
+RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further beyond a wall
 #: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
@@ -41,12 +41,12 @@ _OLD_S: Final = 1.0  # maximum age counted for a position, because the vehicle m
 _AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
 _NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
-_PASSES: Final = 8  # how often a velocity is reduced by all walls in turn before a stop is demanded
+_PASSES: Final = 8  # maximum number of times that a velocity is reduced by all walls in turn before a stop is demanded
 
-#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches.
-#: Above the limit, it sinks at the same rate per metre.
+#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches that
+#: altitude. Above the limit, it sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
-#: Altitudes above ``limits.altitude`` by up to this much count as altimeter noise [m].
+#: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
 SLACK_M: Final = 0.15
 
 
@@ -120,7 +120,7 @@ class Verdict(NamedTuple):
 
     action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
     clamps: tuple[Clamp, ...] = ()  #: the limits that applied
-    refusal: Refusal | None = None  #: None if there is no action either: it resumes at the next fresh position
+    refusal: Refusal | None = None  #: None also (like ``action``) if the request only waits for the next fresh position
     why: str = ""  #: readable reason for the refusal
     enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
 
@@ -136,7 +136,7 @@ class Airspace:
         self._newest: Feedback | None = None
         self._at_ns = 0  # capture time of the newest position, not counting repeats
         self._moves = False  # whether its last permitted set-point makes it move
-        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # each zone's plane when the vehicle was last outside it
+        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # by zone: the plane nearest the vehicle when last outside
         self._ground: deque[tuple[int, float]] = deque()  # times, and heights of the ground in world axes [m]
 
     def judge(
@@ -164,7 +164,7 @@ class Airspace:
         return Verdict(action)
 
     def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Reduce a set-point, or a step towards a target, to what limits and walls allow."""
+        """Reduce a set-point, or a step towards a target, to what the limits and walls allow."""
         self.observe(feedback)
         return self._set_point(action, feedback, now_ns)
 
@@ -186,7 +186,7 @@ class Airspace:
         return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
 
     def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
-        """Return why ``limits.altitude`` must not be this low now, as some vehicles descend to it automatically."""
+        """Return why ``limits.altitude`` must not be this low now; some vehicles descend to it automatically."""
         self.observe(feedback)
         if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
             return ""
@@ -205,7 +205,7 @@ class Airspace:
     def observe(self, feedback: Feedback | None) -> None:
         """Update the vehicle's position: its age, on which side of each zone it is, and the ground below.
 
-        ``jumped_m`` is set if the position has changed by more than the vehicle can have flown.
+        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -300,7 +300,7 @@ class Airspace:
                 if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
                     most -= min(1.0, BRAKE_GAIN / 4 * excess)
                 if _dot(asked, wall.normal) <= 0.0:
-                    most = max(0.0, most)  # unless it requests to go there, a vehicle isn't pushed back
+                    most = max(0.0, most)  # a vehicle isn't pushed back unless its set-point already leads back
                 towards = _dot(wanted, wall.normal)
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
@@ -429,11 +429,11 @@ class Airspace:
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """Return the age of the newest position [s], even if it was repeated."""
+        """Return the age of the newest position [s], even if it is a repeat."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Return whether the newest position is fresh enough to fly to a target; between walls, speed matters, too."""
+        """Return whether the newest position is fresh enough to fly to a target; speed matters between walls."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)
@@ -488,7 +488,7 @@ def _add(a: Vec3, b: Vec3, share: float) -> Vec3:
 
 
 def _to_world(body: Vec3, turn: tuple[float, float]) -> Vec3:
-    """Rotate from levelled body axes to world axes; ``turn`` holds cosine and sine of the yaw."""
+    """Rotate from levelled body axes to world axes; ``turn`` holds the cosine and sine of the yaw."""
     c, s = turn
     return c * body[0] - s * body[1], s * body[0] + c * body[1], body[2]
 

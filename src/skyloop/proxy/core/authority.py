@@ -19,7 +19,7 @@ class QueueEntry:
     """An application that holds the authority or waits for it. Entries sort in the order in which they get it."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of its first request since it last neither held nor requested the authority
+    arrival: int  #: number of its first request since it was last neither holder nor in the queue
     app_id: int
     term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
     #: When the holder, which is being asked, will be pre-empted; None if it is not being asked.
@@ -42,7 +42,7 @@ class Granted:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` if its time is over and others wait."""
+    """The lease ended: its holder released it, fell silent or left, or its time ran out while others were waiting."""
 
     app_id: int
     lease: int
@@ -96,7 +96,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """A request to the holder ended, because the other application left the queue or now waits without asking."""
+    """The request to the holder was withdrawn: the other application left the queue or now waits without asking."""
 
     app_id: int  #: the holder
     lease: int
@@ -125,7 +125,7 @@ class Authority:
         self.last_command_ns = 0  #: time of the last valid command from this or an earlier holder
         self._granted_ns = 0  # when the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
-        #: The last holder if it lost the lease by silence; listed until there is a request for the authority.
+        #: The last holder, if it lost the lease by falling silent; listed until someone requests the authority.
         self.silent: QueueEntry | None = None
         self._last_lease = 0
         self._arrivals = 0
@@ -157,7 +157,7 @@ class Authority:
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return how long an application must wait if all others keep to their times; None if one gave no time."""
+        """Return how long an application must wait if all others keep to their times; None if one has no limit."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -211,7 +211,7 @@ class Authority:
         """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` has not asked.
 
         If the answer grants it, the first in the queue gets the authority, and the holder waits with at most the same
-        priority. A refusal is reported; a strictly higher priority still wins once the time for asking is over.
+        priority. A refusal is reported; a strictly higher priority still wins once the holder's time to answer is over.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -263,7 +263,7 @@ class Authority:
     def _dequeue(
         self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
     ) -> tuple[QueueEntry, bool]:
-        """Remove the application's entry from the queue; return it, and whether the holder was being asked."""
+        """Remove the application's entry from the queue; return it, and whether it had asked the holder."""
         known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
         asked_before = known is not None and known.asks(now_ns)
         if known is not None:

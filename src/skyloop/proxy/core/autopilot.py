@@ -37,7 +37,7 @@ from skyloop.proxy.core.airspace import Airspace, Clamp
 from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: period of the steps that it is designed for
+PERIOD_S: Final = 0.02  #: period of the steps for which the autopilot is designed
 ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
@@ -59,7 +59,7 @@ HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not 
 STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
 #: How long a failsafe tolerates something that prevents a return before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
-CLEARANCE_M: Final = 0.3  #: distance to the ceiling of the room and to the top of the safety box
+CLEARANCE_M: Final = 0.3  #: distance to keep from the ceiling of the room and the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 
 SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
@@ -320,7 +320,7 @@ class StartPoint:
     def __init__(self) -> None:
         self.position: Vec3 | None = None  #: the position [m]; None if unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # when it began to be on the ground; None if it isn't
+        self._standing_ns: int | None = None  # start of the current period on the ground; None in the air
         self._flew = False  # whether it has been seen in the air
         self._open = False  # whether it is taking off, with its position not known yet
 
@@ -399,7 +399,7 @@ class ReturnFlight:
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return None  # the same for every target
+            return None  # this refusal does not depend on the target
         if self.phase is not ReturnPhase.NONE:
             problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
@@ -418,7 +418,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # If outside the box or inside a zone, don't climb first, because the straight line leads back.
+        # Outside the box or inside a zone, don't climb first, because the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:

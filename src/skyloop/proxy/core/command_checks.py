@@ -51,7 +51,7 @@ TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the groun
 #: A landing that withdrew a take-off is done after this time on the ground, because arming may have been in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
-_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates whose repeats are refused without explanation
+_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates of intents whose repeats are refused without explanation
 _LANDINGS: Final = (Land, ReturnToStart)
 _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: after these, the next repeat may succeed
 
@@ -77,7 +77,7 @@ class Intent:
 
     @property
     def over(self) -> bool:
-        """Whether it has ended, so that repeats have no effect."""
+        """Whether this intent has ended; repeats of it then have no effect."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
@@ -91,8 +91,9 @@ class Intent:
     def refuse(self, reason: Refusal, why: str) -> None:
         """End it with a refusal.
 
-        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. Resets
-        always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
+        Resets always do, because the emergency may not be known yet. All of them count as refused until a repeat is
+        executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -100,7 +101,7 @@ class Intent:
             self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
-        """End or complete it according to the vehicle's state; ``shown_ns``: the time of that state, None for now."""
+        """End or complete it according to the vehicle's state at ``shown_ns`` (None: now)."""
         before = self.state
         if state is not FlightState.UNKNOWN:  # an unknown state does not replace a known one
             self.state = state
@@ -129,7 +130,7 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """Return its outcome for feedback, given the application's name and the vehicle's state in that feedback.
+        """Return the intent's outcome for feedback, given the application's name and the vehicle's state there.
 
         A take-off that has just left the ground has no outcome yet: others may have taken the vehicle on its way up.
         """
@@ -212,7 +213,7 @@ class StatePolicy(Enum):
 
     APPLY = auto()
     HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
-    HOVER = auto()  #: hover instead, for a take-off in flight
+    HOVER = auto()  #: for a take-off requested in flight, hover instead
     REFUSE = auto()
 
 
@@ -224,7 +225,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: If the state is unknown, everything is passed on, because some vehicles never report it.
+#: If the state is unknown, all actions are passed on, because some vehicles never report it.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -241,7 +242,7 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
 class Decision(NamedTuple):
     """The decision on a command that passed the first checks."""
 
-    action: AnyAction | None = None  #: the vehicle's new action (a substitute if refused); None if there is none
+    action: AnyAction | None = None  #: the vehicle's new action (a substitute if the command was refused), or None
     refusal: Refusal | None = None
     why: str = ""  #: readable reason for the refusal
     takes_off: bool = False
@@ -362,7 +363,7 @@ class CommandChecks:
         return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
-        """Return why the vehicle could not start a return with a landing now; empty if it could."""
+        """Return why the vehicle could not start a return flight that ends in a landing now; empty if it could."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""

@@ -77,7 +77,7 @@ class StepChange:
 
     step: Failsafe
     reason: str
-    returns: bool = False  #: whether it flies back and lands at its start
+    returns: bool = False  #: whether the vehicle flies back to its start and lands there
     why: str = ""  #: readable reason why it does not return although it should
 
 
@@ -196,7 +196,7 @@ class FailsafeLadder:
 
     @property
     def continues_landing(self) -> bool:
-        """Whether it continues a pilot's landing."""
+        """Whether the ladder continues a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
     @property
@@ -205,13 +205,13 @@ class FailsafeLadder:
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:
-        """Continue a landing whose pilot leaves, or while the vehicle link is lost."""
+        """Continue a landing whose pilot has left, or while the vehicle link is lost."""
         if not self.lands:
             self._want(Land(), now_ns)
 
     @property
     def acts(self) -> bool:
-        """Whether it makes the vehicle hover or land."""
+        """Whether the ladder makes the vehicle hover or land."""
         return self._wanted is not None
 
     def give_up(self) -> None:
@@ -248,7 +248,7 @@ class FailsafeLadder:
         return []
 
     def _should_return(self, reason: str) -> bool:
-        """Return whether a landing for this reason should take place at the start."""
+        """Return whether a landing for this reason should take place at the starting point."""
         return not self.barred and (reason == "battery_return" or self.settings.returns)
 
     def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:

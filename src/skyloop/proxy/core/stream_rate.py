@@ -1,4 +1,4 @@
-"""Estimate the stream rate that a path can carry, by a subscriber's acknowledgements. Pure: time is an argument.
+"""Estimate the stream rate that a path can carry from a subscriber's acknowledgements. Pure: time is an argument.
 
 Low delay has priority. The part of a picture's round trip beyond the shortest recent one counts as waiting in the path.
 If there is a standing queue, the rate falls below the delivery rate (as in Cardwell et al., "BBR: Congestion-Based
@@ -19,8 +19,8 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 
 LEAST_KBIT_S: Final = 60
-#: The initial rate. Single late pictures do not reduce the rate below it, which would help little, because most of
-#: their wait is silence of the path itself.
+#: The initial rate. Single late pictures do not reduce the rate below it: that would help little, because most of their
+#: wait is time in which the path carries nothing.
 START_KBIT_S: Final = 300
 STANDING_S: Final = 0.25  #: the shortest wait within this time is due to a standing queue …
 LONG_WAIT_S: Final = 0.06  #: … and if it is longer than this, the rate falls …
@@ -31,8 +31,8 @@ LATE_FALL: Final = 0.7  #: … and the rate falls to this fraction …
 LATE_EVERY_S: Final = 0.15  #: … once for all pictures that were delayed together within this time
 GROWTH_1_S: Final = 0.1  #: growth of the rate per second …
 SEARCH_1_S: Final = 2.0  #: … and the growth below the initial rate, or as long as nothing has been late
-MOST_WAIT_S: Final = 0.08  #: time's worth of pictures that may be in flight beyond the shortest round trip
-SILENT_S: Final = 0.3  #: a path silent for this long has stalled, which is not the fault of the rate …
+MOST_WAIT_S: Final = 0.08  #: pictures in flight may exceed what the rate delivers in a shortest round trip by this
+SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled, which the rate did not cause …
 SILENT_FALL: Final = 0.5  #: … but the rate is reduced by this factor, because it is uncertain after the stall
 PROBE_S: Final = 0.15  #: while pictures wait, one is sent this often unless more is in flight than the rate allows in …
 PROBES_S: Final = 0.1  #: … this time; during silence, one is sent …
@@ -51,7 +51,7 @@ class _Sent:
 
 
 class StreamRate:
-    """The rate of one stream to one subscriber, at most ``most_kbit_s``. Not thread-safe."""
+    """The rate of one stream to one subscriber, limited to ``most_kbit_s``. Not thread-safe."""
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the current rate
@@ -177,9 +177,9 @@ class StreamRate:
 
 
 #: Factors for the picture's size, and fractions of the pictures to send, best first. If the rate is too low for good
-#: pictures in one form, the next one is used.
+#: pictures with one entry, the next entry is used.
 _LADDER: Final = ((1.0, 1.0), (0.75, 1.0), (0.5, 1.0), (0.5, 0.5), (0.25, 0.5))
-ENOUGH_BITS: Final = 0.05  #: bits per sent pixel below which blocks become visible
+ENOUGH_BITS: Final = 0.05  #: bits per sent pixel below which compression blocks become visible
 
 
 def picture_form(kbit_s: float, pixels_1_s: float) -> tuple[float, float]:

@@ -114,7 +114,7 @@ class Reactor:
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to the server whose handler blocks it; return a new one for all others. Thread-safe.
+        """Leave this reactor to the server whose handler blocks it; return a new reactor for all others. Thread-safe.
 
         No packet is lost or delivered twice, and the packets of each connection keep their order.
         """
@@ -160,7 +160,7 @@ class Reactor:
                 self.inside = None
             begun_s = time.monotonic()
             ready = self._epoll.poll(0 if busy else CHECK_S)
-            # After a pause, a single packet is most likely alone. If there are many, checking each socket for another
+            # After a pause, a packet is most likely the only one. If there are many, checking each socket for another
             # one would cost a system call each; instead, all sockets are polled together until nothing new arrives.
             waited = time.monotonic() - begun_s > _PAUSE_S
             try:
@@ -203,7 +203,7 @@ class Reactor:
             self._lanes[lane].append(source)
 
     def _deliver(self) -> None:
-        """Handle one packet of the source whose turn it is."""
+        """Handle one packet from the source whose turn it is."""
         self._turns += 1
         for lane in _ORDERS[self._turns % len(_ORDERS)]:
             waiting = self._lanes[lane]
@@ -280,7 +280,7 @@ class SharedLocalServer(LocalServer):
     def _drop(self, source: Source) -> None:
         """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # a socket in transit to another reactor is dropped there as soon as it is seen
+        self.reactor.remove(source)  # a socket moving to another reactor is dropped there as soon as it is noticed
 
     # --- the reactor's thread ---
 
@@ -290,7 +290,7 @@ class SharedLocalServer(LocalServer):
         ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
         :meth:`deliver`.
         """
-        with self._lock:  # held from receiving to handling, so that after a split nothing overtakes this packet
+        with self._lock:  # held from receiving to handling, so that nothing overtakes this packet after a split
             if not self._is_current(reactor, source):
                 return False
             connection = source.connection
@@ -317,7 +317,7 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first waiting packet of a source from this lane; return the lane in which to queue it again."""
+        """Handle the first waiting packet of a source from this lane; return the source's next lane."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
                 return None  # it has become more urgent and moved to that lane

@@ -36,7 +36,8 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Connections per process, so that no program can take them all; a cockpit's page that flies has its own connection.
+#: Maximum number of connections per process, so that no program can take them all; a cockpit page that flies has its
+#: own connection.
 MAX_PER_PROCESS: Final = 64
 MAX_PER_USER: Final = 64  #: the same per user with access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: places reserved for pilots
@@ -289,7 +290,7 @@ class LocalServer(TransportServer):
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why it ends the connection, or an empty text. The lock is held."""
+        """Handle one packet; return why it ends the connection, or an empty string. The lock is held."""
         if not packet or connection.ending:
             # An empty packet can't be distinguished from the end of the connection, so it is treated as such.
             return f"the application is gone ({connection.peer.address})"

@@ -23,7 +23,7 @@ SEND_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: flags for callers that wait by other means
 _SO_PEERGROUPS: Final = 59  # Linux 4.13; missing from Python's socket module
 _CREDENTIALS: Final = struct.Struct("3i")
-_MAX_OPTION: Final = 1024  # Python's limit for an option [bytes], which is 256 groups
+_MAX_OPTION: Final = 1024  # Python's limit for a socket option [bytes], enough for 256 groups
 
 
 class Socket(socket.socket):
@@ -118,7 +118,7 @@ class ServerConnection:
         self.admitted = False  #: whether it has identified itself, and the handler has admitted it
         self.pilot = False  #: whether it connected as a pilot
         self.ending = False  #: whether the server is ending it, so that earlier packets no longer count
-        self.reason = ""  #: why it ends, once one end has given a reason
+        self.reason = ""  #: why the connection ends, once either end has given a reason
         self.topics: set[str] = set()
 
     def fileno(self) -> int:
@@ -148,11 +148,11 @@ class ServerConnection:
         return superseded
 
     def limit_silence(self, seconds: float) -> None:
-        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0: for ever."""
+        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0 means forever."""
         set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
 
     def transmit(self, packet: bytes) -> None:
-        """Send a packet without waiting. Any thread. ``OSError``: the application's buffer is full, or it is gone."""
+        """Send a packet without waiting. Any thread. ``OSError``: the application has gone, or its buffer is full."""
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
