@@ -1,4 +1,4 @@
-"""The host: any number of vehicles in one process, which can fail, join and leave without affecting the others."""
+"""The host, which runs any number of vehicles in one process; each can fail, join or leave without affecting others."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Host:
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
         self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
-        self._reactor = Reactor()  # used for vehicles that join
+        self._reactor = Reactor()  # the reactor for vehicles that are added
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -136,8 +136,8 @@ class Host:
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
         """Land a vehicle, end its proxy and forget it; return its last status.
 
-        Raises :class:`RefusedError` and does not remove it if it flies under a lease (code ``flown``), unless it is to
-        ``land`` nevertheless, or has not landed within ``timeout_s`` [s] (``flying``).
+        Raises :class:`RefusedError` and does not remove the vehicle if it flies under a lease (code ``flown``) and
+        ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:

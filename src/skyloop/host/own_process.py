@@ -64,7 +64,7 @@ class OwnProcessVehicle(HostedVehicle):
         self._announce = announce
         self._changed = threading.Condition()  # guards all of the following
         self._reported: VehicleStatus | None = None  # status reported by the current process
-        self._silent_checks = 0  # checks since it last sent a report
+        self._silent_checks = 0  # number of checks since it last sent a report
         self._deaths = 0  # number of deaths in succession
         self._runner = RestartingChild(
             [*command, settings.name],

@@ -22,7 +22,7 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Failed ticks in succession (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: A proxy does everything once in this many rounds, which is ten times a second.
+#: Number of rounds after which a proxy does everything again, ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Ticker:
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
         self._failures = dict.fromkeys(proxies, 0)  # number of failures in succession, by proxy
-        self._lock = threading.Lock()  # guards the knowledge of whose code is running
+        self._lock = threading.Lock()  # guards what is known about whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -223,7 +223,7 @@ class SharedLoop(Protocol):
 
     @property
     def inside(self) -> Any:
-        """Whose code is currently running; None if there is none."""
+        """The object whose code is currently running, or None."""
 
     @property
     def entries(self) -> int:
@@ -310,7 +310,7 @@ class LinkThread:
         self._lock = threading.Lock()  # guards the knowledge of whose code is running
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
-        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with other times are stale
+        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with outdated times are stale
         self._order = count()  # breaks ties between due times
         self._paused: set[ServedLink] = set()  # links that are not polled because of an error
         self._closing = False

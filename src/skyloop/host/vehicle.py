@@ -71,9 +71,9 @@ class HostedVehicle(ABC):
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
         self.condition = Condition.STOPPED
-        self.failed = ""  #: the reason, if it has failed
+        self.failed = ""  #: why it has failed; empty if it has not
         self.started_s = time.monotonic()
-        self.proxy: Proxy | None = None  #: while it serves in this process
+        self.proxy: Proxy | None = None  #: set while the vehicle is served in this process
 
     @abstractmethod
     def start(self) -> None:

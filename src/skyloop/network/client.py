@@ -231,7 +231,7 @@ class FabricClient(TransportClient):
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # the proxy's run, set once a proxy was asked to admit us
+        self._run = ""  # the proxy's run, set once a proxy has been asked to admit us
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
         self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each with its declarations
@@ -534,7 +534,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet; with ``once``, by a datagram, which may be lost."""
+        """Acknowledge a packet, ``once`` in a datagram that may be lost."""
         with self._lock:
             if self._ended:
                 return

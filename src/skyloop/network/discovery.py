@@ -191,8 +191,8 @@ def _search(session: Session) -> set[str]:
 class ProxyWatch:
     """Monitors which transport servers with one name are alive.
 
-    ``on_gone``: called with the run of one that disappears, on one of Zenoh's threads. ``known``: the description of a
-    proxy with this name, if received earlier; it is not requested again.
+    ``on_gone``: called on one of Zenoh's threads with the run of a proxy that disappears. ``known``: the description of
+    a proxy with this name, if received earlier; it is not requested again.
     """
 
     def __init__(

@@ -246,7 +246,7 @@ class ConnectionRegistry:
     def _check_keys(self) -> None:
         """End connections whose keys have been excluded or have expired.
 
-        If there were any, create a new key for published packets, so that they can't read these any more.
+        If there were any, create a new key for published packets, so that they can no longer read them.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:

@@ -153,8 +153,8 @@ class TopicSeal:
     def renew(self) -> None:
         """Create a new key, :attr:`newest`, for all remaining applications; it takes effect after :data:`SWITCH_S`.
 
-        A pending switch is not delayed by another one, because the first excluded application could go on reading. The
-        remaining ones may therefore miss packets until the newer key arrives.
+        A pending switch is not delayed by another one, because otherwise the first excluded application could go on
+        reading. The remaining ones may therefore miss packets until the newer key arrives.
         """
         if self._in_use is self.newest:
             self._since = self._clock() + SWITCH_S

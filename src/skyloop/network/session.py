@@ -60,7 +60,7 @@ class Session:
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
 
     def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
-        """Declare a publisher; packets are dropped if the path is congested and, by ``best_effort``, never resent."""
+        """Declare a publisher; packets are dropped if the path is congested and, with ``best_effort``, never resent."""
         z = load()
         reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
@@ -153,7 +153,7 @@ class _Pool:
             self._close(session)
 
     def retire(self, session: Session) -> None:
-        """Give new users another session from now on; this one closes after its last user."""
+        """Give new users another session from now on; this one closes once its last user has left."""
         with self._changed:
             session.retired = True
 

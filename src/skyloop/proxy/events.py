@@ -25,7 +25,7 @@ from skyloop.zones import THINNEST_M, ZONES, Space
 
 #: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
-MAX_TEXT: Final = 1000  #: characters in an event's text
+MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
 REPEAT_NS: Final = NS_PER_S  #: how often an event that continues is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
@@ -69,7 +69,7 @@ class EventPublisher:
         self._publish = publish
         self._clock = clock
         self._counts = counters.counts
-        self._lock = threading.Lock()  # keeps events in order of their numbers
+        self._lock = threading.Lock()  # keeps events in the order of their numbers
         self._seq = 0
         self._repeats = RepeatedEvents()
         self._missed = 0

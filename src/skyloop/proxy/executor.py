@@ -1,4 +1,4 @@
-"""Execute actions, by the driver if the vehicle supports them, otherwise by the software autopilot; fly returns.
+"""Execute actions with the driver or, if the vehicle doesn't support them, the software autopilot; fly the return.
 
 Not thread-safe: the command handler's lock is held during every call. Parameters and external poses bypass this module.
 """
@@ -52,7 +52,7 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether the path to a target must be checked, so that the software autopilot flies there.
+        #: Whether the path to a target must be checked, in which case the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
@@ -67,7 +67,7 @@ class ActionExecutor:
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may fly; if it never reports its state, that is from the first command on."""
+        """Whether the vehicle flies, or may fly: if it never reports its state, from the first command on."""
         return self.flight.flies(self.state)
 
     @property
@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently: no further commands are sent.
 
-        A vehicle without a hover of its own is also brought to a standstill, as well as a single set-point can.
+        A vehicle without a native hover is also brought to a standstill, as well as a single set-point can.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)

@@ -119,7 +119,7 @@ class CommandHandler(FlightSupervisor):
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering, as well as it can without the proxy, which is ending."""
+        """Leave a flying vehicle hovering as well as it can without the proxy, which is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -203,7 +203,7 @@ class CommandHandler(FlightSupervisor):
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and execute it, on the receiving thread."""
-        # Give it its true age: after a sleep of the computer, an old command looks as if just sent.
+        # After the computer has slept, an old command looks as if it had just been sent: restore its true age.
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -224,8 +224,7 @@ class CommandHandler(FlightSupervisor):
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Return what was applied and when; for a refused command, when it was received."""
         # On a machine that was idle, which is usual before a command, each function call costs microseconds. Ordinary
-        # commands are therefore received, judged and executed in this module, while error messages are written
-        # elsewhere.
+        # commands are therefore received, judged and executed here; error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
@@ -266,7 +265,7 @@ class CommandHandler(FlightSupervisor):
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may come with a substitute, a hover. If the vehicle rejects that, the old one must still end.
+            # A refusal may come with a substitute, a hover. If the vehicle rejects it, the old action must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -295,7 +294,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # This precedes the intent in feedback, where an "arrived" would still be that of the previous return.
+        # Observe the return before reporting the intent, because "arrived" would still refer to the previous return.
         if fresh and self._returns.observe():
             self._stamp()
         self._report_intent(session)
@@ -306,7 +305,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after a new command from an application, or if nobody else is flying the vehicle."""
+        """Make the flight ours after a new command from an application, or if no one else is flying the vehicle."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others

@@ -44,11 +44,10 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.requests import Session
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
-MAX_TEXT: Final = 1024  #: characters in a text value
-MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
+MAX_TEXT: Final = 1024  #: maximum number of characters in a text value
+MAX_PARAMETER: Final = 8192  #: maximum number of bytes in an encoded parameter; larger ones from a driver are left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or not at all, because its writer waits no longer
-#: than that.
+#: A momentary parameter, such as a flip, is written within this time or not at all: its writer won't wait longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -56,7 +55,7 @@ _encoded = msgspec.msgpack.Encoder().encode
 
 
 def described(driver: Driver) -> list[Parameter]:
-    """Return a driver's parameters, plus one that holds its findings. Raises the driver's errors."""
+    """Return a driver's parameters, plus one with the findings of its check. Raises the driver's errors."""
     parameters = list(driver.parameters())
     try:
         diagnostics = driver.checkup()

@@ -67,7 +67,7 @@ from skyloop.proxy.requests import HELLO_NS, MAX_MALFORMED, JobQueue, RequestDis
 from skyloop.proxy.topics import OverviewPublisher
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_NAME: Final = 64  #: characters in a proxy's name
+MAX_NAME: Final = 64  #: maximum number of characters in a proxy's name
 
 _POLL_S: Final = 0.2
 _ABANDON_S: Final = 1.0  #: how long ending a proxy waits for its other parts if the driver hangs
@@ -231,11 +231,11 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight, then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
+        """End the flight, then the proxy, and release all resources. Idempotent. Not for the driver's own threads.
 
-        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle flies.
-        A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it
-        is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
+        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
+        flying. A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in
+        time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
         without the proxy is still landed, however long it takes, because otherwise it would fall. ``unless_flying``: if

@@ -161,7 +161,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def wait_for(self, wanted: Callable[[FlightState], bool], timeout_s: float) -> bool:
-        """Block until the flight state meets a condition; return False after the time-out. Not on drivers' threads."""
+        """Block until the flight state meets a condition; return False after the time-out. Not for drivers' threads."""
         with self._publishing:
             return self._publishing.wait_for(lambda: wanted(self._state), timeout_s)
 
@@ -361,7 +361,7 @@ class VehiclePublisher:
         self._events.publish(EventKind.VEHICLE_LINK, text, severity, data=data)
         if before is state:
             return
-        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known now, so read it again
+        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known by now, so read it again
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:

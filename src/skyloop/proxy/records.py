@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line; ``what`` determines its fields."""
+    """One line of an audit trail, whose other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
@@ -150,7 +150,7 @@ def audit_path(name: str) -> Path:
 
 
 class AuditTrail:
-    """Writes the lines about one run of a proxy in its own thread, so that :meth:`note` never waits for the disk."""
+    """Writes the lines about one run of a proxy on a separate thread, so that :meth:`note` never waits for the disk."""
 
     def __init__(self, path: Path, proxy: str, run: str, wall: Callable[[], datetime] | None = None) -> None:
         """Open the file. Raises ``OSError``."""
@@ -207,9 +207,9 @@ def record_path(name: str) -> Path:
 
 
 class FlightRecord:
-    """The file with one proxy's flight record, written on its own thread from :meth:`start` to :meth:`close`.
+    """The file with one proxy's flight record, written on a separate thread from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: the vehicle's address, as notes about other vehicles are ignored; ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored; ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:

@@ -265,7 +265,7 @@ class WorkerRoster:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """Return the worker that this application is for that processor, if it is one."""
+        """Return the application's worker for that processor, or None if it isn't one."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:

@@ -89,7 +89,7 @@ class Answers:
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
         """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
 
-        Returns whether it has been or is being executed, and whether the limit has been reached.
+        Returns whether the request has been or is being executed, and whether the limit has been reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -189,7 +189,7 @@ class RequestDispatcher:
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer at once, or later on the thread of requests. Called on the receiving thread."""
+        """Answer at once, or later on the requests thread. Called on the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:

@@ -186,7 +186,7 @@ def run(
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail; :class:`UsageError` if a requested file can't be written, unlike the default."""
+    """Give a proxy its audit trail; :class:`UsageError` if it can't be written to ``path``, if given."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -240,7 +240,7 @@ def at_once(
     for one in left:
         try:
             tell(one)
-        except Exception:  # noqa: BLE001  it is still ended
+        except Exception:  # noqa: BLE001 ends are still called
             _log.exception("could not report that several flights end one after another")
     for one in left:
         ends[one]()
@@ -251,7 +251,7 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. On the main thread."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. Main thread only."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)

@@ -43,7 +43,7 @@ _KEEP_SHARE: Final = 1.25
 #: If they overload the path, they are retried after this time, which doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
-_OWN_KBIT_S: Final = 12_000  # highest rate tried for them [kbit/s]
+_OWN_KBIT_S: Final = 12_000  # highest rate tried for the vehicle's own pictures [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
 _OWN_SILENT_NS: Final = nanoseconds(1.0)  # if no picture arrives for this long, the vehicle has stopped sending
 
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with a readable reason."""
+    """One form of one camera's H.264; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
 
     def __init__(
         self,

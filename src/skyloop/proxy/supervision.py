@@ -4,8 +4,8 @@ The lock is also held while the driver is called. The transport's threads delive
 authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions themselves are pure, in
 :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing called under the latter two calls back into
-this module; a driver publishes what it receives on any thread without this lock.
+Lock order: this lock first, then the publisher's, then the events'. Nothing called under the last two locks calls back
+into this module; a driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -189,11 +189,10 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Abandon a hover or landing if the vehicle has long been silent, as it may be on another flight by then.
+        """Abandon a hover or landing if the vehicle has long been silent, because it may be on another flight by then.
 
         After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
-        to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may still be
-        present.
+        to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may be present.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -408,7 +407,7 @@ class FlightSupervisor:
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Let the ladder decide and act; return the events to publish. ``stamps``: the holder has changed."""
+        """Let the ladder decide and act; return the events to publish. ``stamps``: whether the holder has changed."""
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight

@@ -157,7 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # in native telemetry, which has been reported already
+            except (ValueError, TypeError, OverflowError):  # due to native telemetry, and reported already
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -215,8 +215,7 @@ class OverviewPublisher:
     def share(self, registry: OverviewRegistry) -> None:
         """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy but not another, because they would see the others'
-        rows.
+        Does nothing if applications may have access to one proxy but not another, because they would see all rows.
         """
         if not self._server.restricted:
             self.registry = registry

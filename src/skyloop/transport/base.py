@@ -114,7 +114,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send a packet to one application; return False if its buffer is full or it is gone."""
+        """Send a packet to one application; return False if it has gone or its buffer is full."""
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
@@ -150,7 +150,7 @@ class TransportServer(ABC):
 
     @property
     def restricted(self) -> bool:
-        """Whether access to this proxy may not imply access to others, as with keys that name drones."""
+        """Whether access to this proxy need not imply access to others, as with keys that name drones."""
         return False
 
     @property
@@ -160,7 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks: on its receiving thread, one call at a time."""
+    """A transport client's callbacks, called on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""

@@ -260,7 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial; an unknown name (``UsageError``) is just as valid as a refused connection, and raises ``LinkError``."""
+        """Dial; raise ``LinkError`` also for an unknown name, an equally valid result that raises ``UsageError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

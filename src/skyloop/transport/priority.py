@@ -64,7 +64,7 @@ class PacketBacklog:
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the packets up to the first that is not a command; None if there are none."""
+        """The lane of the leading commands or, if there are none, of the first packet; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -90,7 +90,7 @@ class PacketBacklog:
         return superseded
 
     def get(self) -> bytes:
-        """Remove and return the first packet. There must be one."""
+        """Remove and return the first packet. The backlog must not be empty."""
         return self._take(next(iter(self._waiting)))
 
     def _take(self, number: int) -> bytes:
@@ -143,7 +143,7 @@ class PriorityLock:
         self._others: deque[tuple[threading.Lock, int]] = deque()
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock, if ``urgent`` before all waiters that are not; the owner may acquire it again."""
+        """Wait for the lock, ahead of all non-urgent waiters if ``urgent``; the owner may acquire it again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me

@@ -133,7 +133,7 @@ class Agreed:
 
 
 class Agreement:
-    """One end's part in the exchange, using its keys. ``terms`` describe the connection, alike at both ends."""
+    """One end's part in the exchange, using its keys; both ends have the same ``terms`` of the connection."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -199,7 +199,7 @@ def _decode(proof: bytes) -> Proof:
     try:
         return msgspec.msgpack.decode(proof, type=Proof)
     except msgspec.DecodeError:
-        raise LinkError("the other end presents no key: both ends need keys, and a version that presents them") from None
+        raise LinkError("the other end presents no key: both ends need keys, and a version presenting them") from None
 
 
 _WHY: Final = "it was revoked, its rights were changed, or a newer roster is needed here"

@@ -9,7 +9,7 @@
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
 separate authority, in a folder next to the lab's keys. Users have their browsers trust it, which is safe because it
-can't certify anything beyond private networks. Its key gives no access to the lab's network, the lab's none to pages.
+can't certify anything beyond private networks. Its key and the lab's key are not interchangeable.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust
@@ -111,7 +111,7 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create or renew an identity's key and certificate; a revoked name only after its lost key has expired."""
+        """Create or renew an identity's key and certificate; a revoked name is free once its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")

@@ -37,7 +37,7 @@ LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be th
 
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
 _BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
-_OLD_S: Final = 1.0  # maximum age counted for a position, because the vehicle may be at rest
+_OLD_S: Final = 1.0  # maximum age taken into account for a position, because the vehicle may be at rest
 _AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
 _NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
@@ -52,7 +52,7 @@ SLACK_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Clamp:
-    """A limit that reduced a set-point. For tilt and speed, the two numbers are lengths of the vector."""
+    """A limit that reduced a set-point. For tilt and speed, the two numbers are the vector's lengths."""
 
     limit: str  #: name of the parameter
     asked: float
@@ -203,7 +203,7 @@ class Airspace:
         return other
 
     def observe(self, feedback: Feedback | None) -> None:
-        """Update the vehicle's position: its age, on which side of each zone it is, and the ground below.
+        """Update what is known about the vehicle's position: its age, its side of each zone, and the ground below it.
 
         ``jumped_m`` is set if the position has changed by more than the vehicle could have flown.
         """
@@ -248,7 +248,7 @@ class Airspace:
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point between the walls, its limits, and whether the position is known.
+        """Return the nearest set-point between the walls, the limits that applied, and whether the position is known.
 
         If it is not, the set-point is unchanged.
         """
@@ -275,7 +275,7 @@ class Airspace:
         walls = [] if space.box is None else list(space.box.walls_inside(at))
         for zone in space.barriers:
             wall = zone.wall_outside(at)
-            # Inside a zone, the nearest plane could be on the far side: keep the one from when it was outside.
+            # Inside a zone, the nearest plane could be on the far side: keep the one from before the vehicle entered.
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
                 wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
@@ -288,7 +288,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
-        # Beyond walls, stop unless the velocity leads back through at least one of them, and further beyond none.
+        # Beyond walls, stop unless the velocity leads back through at least one and no further beyond any other.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
@@ -300,7 +300,7 @@ class Airspace:
                 if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
                     most -= min(1.0, BRAKE_GAIN / 4 * excess)
                 if _dot(asked, wall.normal) <= 0.0:
-                    most = max(0.0, most)  # a vehicle isn't pushed back unless its set-point already leads back
+                    most = max(0.0, most)  # a vehicle is pushed back only if its set-point leads towards the wall
                 towards = _dot(wanted, wall.normal)
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
@@ -375,7 +375,7 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        # Only once, because the direction changes near the target.
+        # This is reported only once, because the direction changes near the target.
         if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:

@@ -2,7 +2,7 @@
 
 Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
 number is unique in this run. A strictly higher priority takes over at once, or after the holder has been asked. A
-pre-empted pilot waits in the queue, which is ordered by priority and first arrival. A holder that requested the
+pre-empted pilot waits in the queue, which is ordered by priority, then by time of arrival. A holder that requested the
 authority for a limited time loses it once that time is over and the queue isn't empty. See ``docs/proxy.md``.
 """
 
@@ -42,7 +42,7 @@ class Granted:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: its holder released it, fell silent or left, or its time ran out while others were waiting."""
+    """The lease ended: ``released``, its holder ``silent`` or ``gone``, or ``expired`` while others were waiting."""
 
     app_id: int
     lease: int
@@ -246,7 +246,7 @@ class Authority:
                 self.silent = holder
             return effects
         effects = self._settle(now_ns)
-        if self._is_over(now_ns) and not self._expiry_reported:  # the queue is empty, or it would have been relieved
+        if self._is_over(now_ns) and not self._expiry_reported:  # otherwise the next in the queue would have taken over
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects

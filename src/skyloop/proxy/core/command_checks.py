@@ -48,7 +48,7 @@ from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn
-#: A landing that withdrew a take-off is done after this time on the ground, because arming may have been in progress.
+#: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates of intents whose repeats are refused without explanation
@@ -92,8 +92,7 @@ class Intent:
         """End it with a refusal.
 
         Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
-        Resets always do, because the emergency may not be known yet. All of them count as refused until a repeat is
-        executed.
+        Resets always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -132,7 +131,7 @@ class Intent:
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
         """Return the intent's outcome for feedback, given the application's name and the vehicle's state there.
 
-        A take-off that has just left the ground has no outcome yet: others may have taken the vehicle on its way up.
+        A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
         fate = self.fate  # read first, because another thread may end it now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
@@ -348,7 +347,7 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Return whether the vehicle's position matters: for a hover in flight, for a take-off on the ground."""
+        """Return whether the vehicle's position matters: to a hover in flight, or to a take-off from the ground."""
         if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take it back
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)

@@ -135,7 +135,7 @@ class FailsafeLadder:
         self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
         self._overruled = False  # whether the pilot has overruled a return because of the battery
         self._wanted: FailsafeTask | None = None
-        self.given_up = False  #: an abandoned hover or pilot's landing may still be executed by a silent vehicle
+        self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
         self.wanted_ns = 0  #: when its current task began
         self._taken = False
         self._next_try_ns = 0
@@ -147,7 +147,7 @@ class FailsafeLadder:
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # leave a flight of others alone, whatever its problems
+        if not inputs.ours:  # leave a flight by others alone, whatever its problems
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
@@ -163,7 +163,7 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers keep a landing only while requested
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers continue a landing only while requested
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
@@ -186,7 +186,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery, which ends by a pilot's decision, not a set-point."""
+        """Whether it returns or lands because of a low battery, which only a pilot's decision ends, not a set-point."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:

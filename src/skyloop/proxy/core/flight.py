@@ -29,8 +29,7 @@ from skyloop.messages import (
 CLAIM_NS: Final = nanoseconds(15.0)
 #: If the vehicle rises in spite of a cancelled take-off, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over once the vehicle has been on the ground for this long, so bounces and brief false reports don't end
-#: it.
+#: A flight is over after this time on the ground, so that bounces and brief false reports don't end it.
 STANDING_NS: Final = nanoseconds(1.0)
 #: How long a flight that can't be observed counts as this proxy's; after that, it may be a different one.
 BELIEF_NS: Final = nanoseconds(60.0)
@@ -84,7 +83,7 @@ class Flight:
         self._shared = shared
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
-        self.left_to = ""  #: the driver's word for what others made it do
+        self.left_to = ""  #: what others made the vehicle do, as the driver reports it
         self._believed_until_ns: int | None = None  # until then, a vehicle found in the air is on an old run's flight
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
         self._grounded_ns: int | None = None  # start of the current period on the ground
@@ -174,7 +173,7 @@ class Flight:
         return self._shared
 
     def slept(self, ns: int) -> None:
-        """Handle a sleep of the computer, which its clock does not count: it may be another flight by now."""
+        """Allow for the time that the computer slept without its clock running: a different flight may be under way."""
         if self._believed_until_ns is not None:
             self._believed_until_ns -= ns
         if self._claimed_until_ns is not None:
@@ -234,7 +233,7 @@ class Flight:
 
     def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver has said who took over, the flight is over, or nobody else can fly the vehicle
+            return ""  # the driver has said who took over, the flight is over, or no one else can fly the vehicle
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
@@ -278,9 +277,9 @@ class Flight:
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
         """Return whether the steered task has ended on the ground, so that the vehicle is no longer steered.
 
-        If the vehicle reports its state, that counts. Otherwise, a descent has reached the ground when the altimeter
-        reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and its
-        result is unknown.
+        If the vehicle reports its state, that report counts. Otherwise, a descent has reached the ground when the
+        altimeter reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and
+        its result is unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:

@@ -139,7 +139,7 @@ class StreamRate:
             _, since_ns, before = waits[0]
             delivered_kbit_s = (self._delivered - before) * 8e-3 / max(seconds(now_ns - since_ns), 0.001)
             self._fall(FALL * delivered_kbit_s)
-            waits.clear()  # and measure again
+            waits.clear()  # measure again from here
         elif wait_s > LATE_S:
             if now_ns - self._late_ns >= nanoseconds(LATE_EVERY_S):
                 self._late_ns = now_ns

@@ -33,7 +33,7 @@ _AFTER_FAILURE_S: Final = 0.01
 _PAUSE_S: Final = 100e-6  # a wait this long means that nothing was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: Which lanes go first, turn by turn: even if something is always urgent, the others each get one turn in four.
+#: Order of the lanes, turn by turn: even if something is always urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
@@ -198,7 +198,7 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Queue a source for a turn in a lane, or for None, in no lane. On the reactor's thread."""
+        """Queue a source for a turn in a lane; do nothing if there is no lane. Called on the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 

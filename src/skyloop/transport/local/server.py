@@ -36,8 +36,7 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Maximum number of connections per process, so that no program can take them all; a cockpit page that flies has its
-#: own connection.
+#: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
 MAX_PER_PROCESS: Final = 64
 MAX_PER_USER: Final = 64  #: the same per user with access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: places reserved for pilots
@@ -67,7 +66,7 @@ class LocalServer(TransportServer):
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # a thread must hold it to call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # number of commands replaced by newer ones behind them
+        self._superseded = 0  # number of commands replaced by newer ones that arrived behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping

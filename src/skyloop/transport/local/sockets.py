@@ -80,7 +80,7 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the connecting process has access: as our own user, the superuser, or a member of the group."""
+    """Return whether the connecting process has access: it is our own user's, the superuser's or a group member's."""
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
