@@ -98,7 +98,7 @@ class Fleet(msgspec.Struct, frozen=True):
 
     name: str
     vehicles: tuple[VehicleSettings, ...]
-    defaults: Defaults  #: for vehicles added by address
+    defaults: Defaults  #: the defaults for vehicles added by address
 
 
 def read_fleet(path: Path) -> Fleet:

@@ -213,7 +213,7 @@ class Host:
     def close(
         self, reason: str = "the host was stopped", within_s: float = 0.0, hurry: Callable[[], bool] = lambda: False
     ) -> None:
-        """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
+        """End all flights (landing for up to ``within_s`` [s]), proxies, and threads that are not stuck. Idempotent.
 
         ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
         does Ctrl-C if nothing else handles it; ``KeyboardInterrupt`` is then raised at the end.

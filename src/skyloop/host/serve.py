@@ -274,7 +274,7 @@ class ControlServer:
         received = bytearray()
         while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
             received += packet
-            if len(packet) != _CHUNK:  # it was the last packet
+            if len(packet) != _CHUNK:  # that was the last packet
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)

@@ -92,7 +92,7 @@ class Ticker:
                 proxies = list(self._failures)
             for place, proxy in enumerate(proxies, rounds):  # a fifth of the sockets per round, to spread the work
                 failures = self._failures.get(proxy)
-                if failures is not None:  # no other ticker has taken it over
+                if failures is not None:  # no other ticker has taken over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
 
@@ -307,7 +307,7 @@ class LinkThread:
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards the knowledge of whose code is running
+        self._lock = threading.Lock()  # guards what is known about whose code is running
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
         self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with outdated times are stale
@@ -359,7 +359,7 @@ class LinkThread:
             self._selector.unregister(link)
 
     def _plan(self, link: ServedLink, due_ns: int) -> None:
-        """Schedule a link to be served by the given time. The lock must be held."""
+        """Schedule a link to be served by the given time. The caller holds the lock."""
         if self._due_ns.get(link) == due_ns:
             return
         self._due_ns[link] = due_ns
@@ -369,14 +369,14 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due, or None if there is none. The lock must be held."""
+        """Return when the next link is due, or None if there is none. The caller holds the lock."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
         return queue[0][0] if queue else None
 
     def _due(self, now_ns: int) -> set[ServedLink]:
-        """Return the links that are due. The lock must be held."""
+        """Return the links that are due. The caller holds the lock."""
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
@@ -414,7 +414,7 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread has taken it over in the meantime
+                return  # another thread has taken over since then
             if link in self._paused:
                 self._paused.remove(link)
                 readable = True  # it may be readable: it was not polled

@@ -94,7 +94,7 @@ class HostedVehicle(ABC):
 
     @property
     def runs(self) -> bool:
-        """Return whether it has a proxy or is about to have one."""
+        """Return whether the vehicle has a proxy or is about to have one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
@@ -133,7 +133,7 @@ class SharedVehicle(HostedVehicle):
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
-        self._settled = threading.Event()  # set when it runs or has failed to start
+        self._settled = threading.Event()  # set when the vehicle is running or has failed to start
 
     def start(self) -> None:
         try:
@@ -243,7 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run something that may hang on a separate thread, and raise its exceptions here.
 
-    Returns whether the call returned in time. If it did not, its daemon thread keeps running.
+    Returns whether the call returned in time. Otherwise, the daemon thread keeps running.
     """
     raised: list[BaseException] = []
 

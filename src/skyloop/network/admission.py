@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from skyloop.network.keys import Identity, KeyRing
 
 MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
-#: Connections per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
+#: Connections allowed per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
 #: Connections reserved for keys that may fly this drone, so that other keys, however many, can't lock pilots out.
 FOR_PILOTS: Final = 64

@@ -357,7 +357,7 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet until it is acknowledged; return False if there is no room for it. The lock must be held."""
+        """Send a packet until it is acknowledged; return False if there is no room for it. Hold the lock."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False
@@ -367,7 +367,7 @@ class FabricClient(TransportClient):
         return True
 
     def _send_due(self) -> None:
-        """Send the packets that are due. The lock must be held."""
+        """Send the packets that are due. The caller holds the lock."""
         for number, packet, way in self._outgoing.due(time.monotonic()):
             self._put(way, packet, number)
 
@@ -534,7 +534,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet, ``once`` in a datagram that may be lost."""
+        """Acknowledge a packet; ``once``: in a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return

@@ -99,7 +99,7 @@ class FabricSettings:
 
     @property
     def reach(self) -> str:
-        """Where proxies are searched for, as text for users."""
+        """Text for users that says where proxies are searched for."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 

@@ -61,7 +61,7 @@ class ServerConnection:
         self.left = False  #: the application has unsubscribed from everything for good
 
     def may_command(self, drone: str) -> bool:
-        """Return whether its proven identity permits more than queries to this drone."""
+        """Return whether the application's proven identity permits more than queries to this drone."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 

@@ -37,7 +37,7 @@ class _Packet:
     number: int
     data: bytes
     way: str
-    sent_s: float = 0.0  #: when it was last sent; 0: not yet
+    sent_s: float = 0.0  #: when the packet was last sent; 0: not yet
 
 
 class Outgoing:
@@ -166,7 +166,7 @@ class Pace:
 
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
-        self._eager = False  # it acknowledges more often than required, so its silence is significant
+        self._eager = False  # the other end acknowledges more often than required, so its silence is significant
         self._sent_s = -math.inf  # when the newest packet was sent
         self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 

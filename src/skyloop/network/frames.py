@@ -1,7 +1,7 @@
 """Send the server's video. Each subscribed variant of a frame is encoded once and sent no faster than readers take it.
 
-Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until it acknowledges one; then it
-gets the newest. A slow link thus shows fewer frames, but never old ones.
+Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until the reader acknowledges one;
+then it gets the newest. A slow link thus shows fewer frames, but never old ones.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Reader:
     def __init__(self) -> None:
         self._on_way: deque[tuple[int, int]] = deque()  # number and time sent
         self.due = False  #: the newest frame should be sent to it
-        self.waits = False  #: it has missed a frame
+        self.waits = False  #: the connection has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
         """Return whether another frame may be sent. Frames sent longer than :data:`LOST_NS` ago are considered lost."""

@@ -278,7 +278,7 @@ class ConnectionRegistry:
     # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that must arrive. Return False if the connection has ended or this ends it. Any thread."""
+        """Send a packet that must arrive. Return False if the connection has ended or ends here. Any thread."""
         if connection.ended:
             return False
         if problem := connection.queue(packet):

@@ -1,7 +1,7 @@
 """The proxy's end of the fabric transport.
 
 Zenoh's threads only sort incoming packets. A separate thread calls the handler, commands first, so that a slow handler
-does not delay signs of life. A third one sends to individual applications, so that an application that acknowledges
+does not delay signs of life. A third thread sends to individual applications, so that an application that acknowledges
 nothing does not delay the handler. Sending never blocks on an application.
 """
 

@@ -76,7 +76,7 @@ class Session:
             return set()
 
     def shut_out(self) -> frozenset[str]:
-        """Return the linked nodes that the newest roster excludes; Zenoh still applies the one from its start."""
+        """Return the linked nodes that the newest roster excludes; Zenoh still applies the roster from its start."""
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
@@ -255,7 +255,7 @@ def undeclare(held: Iterable[Any]) -> None:
         for _ in range(_BORROWED):
             try:
                 each.undeclare()
-            except ended:  # the session has ended, and its declarations with it
+            except ended:  # the session has ended, and so have its declarations
                 break
             except RuntimeError:  # "Already borrowed": another thread is sending with it
                 time.sleep(_BORROWED_S)

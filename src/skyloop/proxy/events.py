@@ -26,7 +26,7 @@ from skyloop.zones import THINNEST_M, ZONES, Space
 #: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
-REPEAT_NS: Final = NS_PER_S  #: how often an event that continues is published again
+REPEAT_NS: Final = NS_PER_S  #: interval at which a continuing event is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
 #: Why a hover or landing is abandoned.
@@ -239,7 +239,7 @@ def thin_zones_event(space: Space) -> EventDraft:
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event for a position that changed by more than flying explains, ``lands``: during a landing."""
+    """Return the event for a jump of the position; ``lands``: whether the vehicle was landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}

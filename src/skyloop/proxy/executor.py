@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently: no further commands are sent.
 
-        A vehicle without a native hover is also brought to a standstill, as well as a single set-point can.
+        A vehicle without a native hover is also stopped, as far as a single set-point can do that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)

@@ -94,7 +94,7 @@ class CommandHandler(FlightSupervisor):
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return why a momentary parameter, such as a flip, must not be written now, as text; empty if it may."""
+        """Return a readable reason not to write a momentary parameter, such as a flip, now; empty if there is none."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
@@ -114,7 +114,7 @@ class CommandHandler(FlightSupervisor):
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # keep withdrawing it, because nothing does so later
+                self._rising_until_ns = now_ns  # keep withdrawing the take-off, because nothing else does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 

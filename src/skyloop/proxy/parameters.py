@@ -137,8 +137,8 @@ OWN: Final[tuple[Parameter, ...]] = (
 def check(parameter: Parameter, value: Value) -> Value:
     """Return the value to write, checked for type, finiteness, range and choices.
 
-    An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError` that names the
-    allowed values, with the :class:`Refusal` as its code.
+    An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError`, which names the
+    allowed values and has the :class:`Refusal` as its code.
     """
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)

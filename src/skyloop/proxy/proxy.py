@@ -169,7 +169,7 @@ class Proxy:
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = False
-        self.ended = False  #: whether it is ending, or has ended
+        self.ended = False  #: whether the proxy is ending, or has ended
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode

@@ -89,7 +89,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # the same as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -312,7 +312,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as encoded by the vehicle."""
+        """Publish a frame as encoded by the vehicle."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -330,7 +330,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded pictures have receivers."""
+        """Return whether this camera's encoded frames have receivers."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:

@@ -1,11 +1,11 @@
-"""Write a proxy's files, each in its own thread: the audit trail, and the note about its flight.
+"""Write a proxy's files, each on a separate thread: the audit trail, and the note about its flight.
 
 The audit trail records who flew when, as one JSON object per line, append-only. ``docs/sharing.md`` describes it.
 :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
-The note records that a flight is this proxy's, so that after being killed and restarted, a proxy ends its own flight.
-It is written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over,
-belongs to others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
+The note records that a flight is this proxy's, so that a proxy that was killed and restarted ends its own flight. It is
+written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over, belongs to
+others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Tenure(msgspec.Struct, frozen=True):
     identity: str
     priority: int
     begin: datetime
-    end: datetime | None  #: None if it continues, or if the proxy was killed
+    end: datetime | None  #: None if the tenure continues, or if the proxy was killed
     how: str  #: why it ended; empty if, according to the file, it has not ended
     takeoffs: int = 0
 

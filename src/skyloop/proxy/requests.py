@@ -45,7 +45,7 @@ MAX_MALFORMED: Final = 50
 HELLO_NS: Final = 5 * NS_PER_S
 
 MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat requests for a few seconds at most
-MAX_MESSAGE: Final = 1000  #: characters in a refusal's message
+MAX_MESSAGE: Final = 1000  #: maximum number of characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
 #: Requests that change something. Others may be answered again, with the state at the time of the repeat.
@@ -152,7 +152,7 @@ Answer = Callable[[Session, Any, int], AnyReply]
 
 
 class RequestDispatcher:
-    """Answers requests on the receiving thread or the thread of jobs, from :meth:`start` to :meth:`stop`.
+    """Answers requests on the receiving thread or the jobs thread, from :meth:`start` to :meth:`stop`.
 
     ``immediate`` and ``deferred``: the functions for these threads, by type of the request's body. Errors raised by
     deferred ones become refusals: ``on_failure`` gets the request's name and an unexpected error, and returns the text

@@ -215,7 +215,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """React to a sleep of the computer, after which everything is older than its timestamp suggests."""
+        """React to the computer having slept, after which everything is older than its timestamp suggests."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -325,7 +325,7 @@ class FlightSupervisor:
         return True
 
     def _report_intent(self, session: Session) -> None:
-        """Publish the outcome of an application's newest intent in feedback, soon if it has ended."""
+        """Publish the outcome of an application's newest intent in feedback, promptly if it has ended."""
         self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
@@ -346,7 +346,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow the software autopilot for a step."""
+        """Return the nearest velocity that the limits, safety box and zones allow for the software autopilot's step."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):

@@ -47,7 +47,7 @@ def video(camera: str) -> str:
 
 
 def stream(camera: str) -> str:
-    """Return the topic of a camera's pictures as encoded by the vehicle (EncodedFrame)."""
+    """Return the topic of a camera's frames as encoded by the vehicle (EncodedFrame)."""
     return f"stream/{camera}"
 
 
@@ -213,7 +213,7 @@ class TransportClient(ABC):
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends read the same monotonic clock, being on one host, so that the offset is zero.
+        """Whether both ends are on one host and read the same monotonic clock, so that the offset is zero.
 
         An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
         """

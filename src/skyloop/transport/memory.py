@@ -173,8 +173,8 @@ class MemoryClient(TransportClient):
         # Items: a packet, the name of a camera with a frame to deliver, or None if the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # whether either end has ended it, so that nothing can be sent
-        self._closing = False  # whether this end has closed it, so that nothing more is delivered
+        self._ended = False  # whether either end has ended the connection, so that nothing can be sent
+        self._closing = False  # whether this end has closed the connection, so that nothing more is delivered
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:

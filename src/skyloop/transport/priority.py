@@ -155,7 +155,7 @@ class PriorityLock:
         woken.acquire()
         with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
-        self._hand_over()  # it may have been released since the first attempt
+        self._hand_over()  # the lock may have been released since the first attempt
         woken.acquire()  # the releaser has made this thread the owner
 
     def release(self, *_: object) -> None:

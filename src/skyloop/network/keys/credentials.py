@@ -85,7 +85,7 @@ class Roster(msgspec.Struct, frozen=True):
 
     @property
     def identities(self) -> list[Identity]:
-        """The identities that may join: all not revoked. The handshake checks whether their certificates are valid."""
+        """All identities that may join (not revoked). The handshake checks whether their certificates are valid."""
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:

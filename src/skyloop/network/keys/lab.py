@@ -1,4 +1,4 @@
-"""A lab's authority, a folder that issues and revokes identities; and certificates for cockpit pages.
+"""Manage a lab's authority, a folder that issues and revokes identities, and certificates for cockpit pages.
 
 ================  ========================================================================
 ``ca.key``        the authority's private key: its holder can create any identity

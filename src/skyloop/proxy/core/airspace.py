@@ -27,7 +27,7 @@ BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target w
 #: A position has jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
 MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; any further out, only moving back is allowed
-BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
+BRAKE_GAIN: Final = 2.0  #: requested deceleration per unit of excess speed [1/s]
 RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further beyond a wall
 #: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
@@ -132,10 +132,10 @@ class Airspace:
         self.settings = settings or AirspaceSettings()
         self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
         self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space when it was permitted
-        self._sinks = self._blocked = False  # whether it is sinking to the ceiling, and whether something is in the way
+        self._sinks = self._blocked = False  # whether the vehicle is sinking to the ceiling, and whether it is blocked
         self._newest: Feedback | None = None
         self._at_ns = 0  # capture time of the newest position, not counting repeats
-        self._moves = False  # whether its last permitted set-point makes it move
+        self._moves = False  # whether the vehicle's last permitted set-point makes it move
         self._sides: dict[Zone, tuple[Vec3, float]] = {}  # by zone: the plane nearest the vehicle when last outside
         self._ground: deque[tuple[int, float]] = deque()  # times, and heights of the ground in world axes [m]
 
@@ -262,7 +262,7 @@ class Airspace:
         walls = self._walls(feedback.position_m)
         turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
         now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
-        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come closer since the measurement
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # the vehicle has moved since
             walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True

@@ -188,7 +188,7 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # it must request the authority again, like all others
+            effects.append(self._relieve())  # the application must request the authority again, like all others
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
@@ -336,7 +336,7 @@ class Authority:
     def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first in the queue if due.
 
-        This is due if there is no holder, its time is over, or an entry with strictly higher priority need not wait.
+        This is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """
         effects: list[Effect] = []
         holder = self.holder

@@ -236,7 +236,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # it may be anywhere when it is next received, and will hold that position
+        if known is None:  # the vehicle may be anywhere when it is next received, and will hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -322,7 +322,7 @@ class StartPoint:
         self._state = FlightState.UNKNOWN
         self._standing_ns: int | None = None  # start of the current period on the ground; None in the air
         self._flew = False  # whether it has been seen in the air
-        self._open = False  # whether it is taking off and its position is not known yet
+        self._open = False  # whether the vehicle is taking off and its position is not known yet
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
         """Observe the vehicle; if it briefly reports "landed" while in the air, the start does not change."""

@@ -69,8 +69,8 @@ class Intent:
     asked_ns: int
     state: FlightState  #: the vehicle's state when it was requested, or last observed
     fate: Fate = Fate.UNDER_WAY
-    begun: bool = False  #: whether the vehicle has started to execute it
-    automatic: bool = False  #: whether the library itself requested it
+    begun: bool = False  #: whether the vehicle has started to execute the intent
+    automatic: bool = False  #: whether the library itself requested the intent
     withdrew: bool = False  #: whether it ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
@@ -81,7 +81,7 @@ class Intent:
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End it unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
+        """End the intent unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
@@ -89,7 +89,7 @@ class Intent:
             self.fate = fate  # last, because other threads read it without a lock
 
     def refuse(self, reason: Refusal, why: str) -> None:
-        """End it with a refusal.
+        """End the intent with a refusal.
 
         Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
         Resets always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
@@ -100,7 +100,7 @@ class Intent:
             self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
-        """End or complete it according to the vehicle's state at ``shown_ns`` (None: now)."""
+        """End or complete the intent according to the vehicle's state at ``shown_ns`` (None: now)."""
         before = self.state
         if state is not FlightState.UNKNOWN:  # an unknown state does not replace a known one
             self.state = state
@@ -133,7 +133,7 @@ class Intent:
 
         A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
-        fate = self.fate  # read first, because another thread may end it now
+        fate = self.fate  # read first, because another thread may end the intent now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -155,7 +155,7 @@ class Intents:
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
         self._floor = -1  # intents up to this one were ended by an event
-        self._ended = Fate.AUTHORITY  # the fate that this event caused
+        self._ended = Fate.AUTHORITY  # the fate of these intents
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
@@ -303,7 +303,7 @@ class CommandChecks:
         if new and kind is ReturnToStart:
             self.way_back = None
         if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
-            policy = StatePolicy.HOLD  # it is already landing, which an automatic hover does not abort
+            policy = StatePolicy.HOLD  # already landing, which an automatic hover does not abort
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)

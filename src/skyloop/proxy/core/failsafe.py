@@ -136,7 +136,7 @@ class FailsafeLadder:
         self._overruled = False  # whether the pilot has overruled a return because of the battery
         self._wanted: FailsafeTask | None = None
         self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
-        self.wanted_ns = 0  #: when its current task began
+        self.wanted_ns = 0  #: when the current task began
         self._taken = False
         self._next_try_ns = 0
 
@@ -186,7 +186,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery, which only a pilot's decision ends, not a set-point."""
+        """Whether it returns or lands because of a low battery; a pilot's decision ends that, a set-point does not."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
@@ -274,7 +274,7 @@ class FailsafeLadder:
             return []
         if self._taken and state not in _CONTRADICTIONS[type(wanted)]:
             return []
-        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these manoeuvres end safely without it
+        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these manoeuvres end safely without a hover
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []

@@ -1,4 +1,4 @@
-"""Track one flight: whether the vehicle flies, whose flight it is, how certain both are. Pure: time is an argument.
+"""Track one flight: whether the vehicle is flying, whose flight it is, and how sure that is. Pure: time is an argument.
 
 The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
 mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
@@ -84,10 +84,10 @@ class Flight:
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
         self.left_to = ""  #: what others made the vehicle do, as the driver reports it
-        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air is on an old run's flight
+        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air counts as an old run's
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
         self._grounded_ns: int | None = None  # start of the current period on the ground
-        self._steered = False  # whether it is steered in software, with the task in :attr:`_state`
+        self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
         self._begun_ns = 0  # when the steered task began
         self._was_up = False  # whether the vehicle has reported being in the air while steered
@@ -116,7 +116,7 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether it flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
+        """Return whether the vehicle flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
 
         In an unknown state, it counts as flying if it was seen flying or has been commanded to fly.
         """
@@ -287,7 +287,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # It may be about to rise, so reports from before the command prove nothing.
+            # The vehicle may be about to rise, so reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

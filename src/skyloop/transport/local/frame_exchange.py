@@ -43,7 +43,7 @@ class SlotMemory:
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that hold it, plus the server while it writes to it or keeps it for viewers
+        self.holders = 0  #: clients that hold the slot, plus the server while it writes to it or keeps it for viewers
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.posix_fallocate(self.fd, 0, capacity)  # fail here if memory is short, rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -86,7 +86,7 @@ class Viewer:
     leases: dict[int, SlotMemory] = field(default_factory=dict)
     announced: set[int] = field(default_factory=set)
     retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
-    active: bool = True  #: whether it gets frames; if not, it may still hold some
+    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some
     waits: bool = False  #: whether the viewer was skipped and is waiting for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
@@ -184,7 +184,7 @@ class Camera:
         """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
-        with contextlib.suppress(OSError):  # if this fails, it keeps the slots mapped until it ends
+        with contextlib.suppress(OSError):  # if this fails, the client keeps the slots mapped until it ends
             viewer.connection.transmit(packets.retire(self.number, self._next_number))
         self._trim()
 
@@ -276,5 +276,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # it is recreated for the next viewer, because unused names must not accumulate
+                if not camera.viewers:  # recreated for the next viewer, because unused names must not accumulate
                     del self._cameras[name]

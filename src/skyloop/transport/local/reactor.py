@@ -40,7 +40,7 @@ _ORDERS: Final = (
     _FIRST_COME,
     (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
 )
-_THREAD_CHECK_S: Final = 0.1  # how often a wait for connections checks whether their thread has ended
+_THREAD_CHECK_S: Final = 0.1  # interval at which a wait for connections checks whether their thread has ended
 _log = logging.getLogger(__name__)
 
 
@@ -55,9 +55,9 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: the lane in which it waits
+        self.lane: Lane | None = None  #: the lane in which the source waits
         self.ended = False
-        self.muted = False  #: whether it is ignored until the next check
+        self.muted = False  #: whether the source is ignored until the next check
 
 
 class _Thread(threading.Thread):
@@ -69,7 +69,7 @@ class Reactor:
 
     def __init__(self) -> None:
         self.inside: SharedLocalServer | None = None  #: the server whose handler is, or may be, running
-        self.entries = 0  #: how often :attr:`inside` was set
+        self.entries = 0  #: number of times that :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
         self._epoll = select.epoll()
@@ -320,7 +320,7 @@ class SharedLocalServer(LocalServer):
         """Handle the first waiting packet of a source from this lane; return the source's next lane."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
-                return None  # it has become more urgent and moved to that lane
+                return None  # the source has become more urgent and moved to that lane
             source.lane = None
             connection = source.connection
             if connection is None or not connection.backlog:

@@ -49,7 +49,7 @@ class Socket(socket.socket):
         if last_packet:
             with suppress(OSError):
                 self.send(last_packet, SEND_FLAGS)
-        with suppress(OSError):  # it had already ended
+        with suppress(OSError):  # the connection had already ended
             self.shutdown(socket.SHUT_RDWR)
 
 
@@ -114,10 +114,10 @@ class ServerConnection:
         self.poll = poll.poll  #: returns whether a packet, or the end, is waiting; for the receiving thread
         self.backlog = PacketBacklog()  #: packets taken from the socket, but not handled yet
         self.peer = peer
-        self.joined = False  #: whether it has sent Hello, and the handler knows it
-        self.admitted = False  #: whether it has identified itself, and the handler has admitted it
+        self.joined = False  #: whether the application has sent Hello, and the handler knows it
+        self.admitted = False  #: whether the application has identified itself, and the handler has admitted it
         self.pilot = False  #: whether it connected as a pilot
-        self.ending = False  #: whether the server is ending it, so that earlier packets no longer count
+        self.ending = False  #: whether the server is ending the connection, so that earlier packets no longer count
         self.reason = ""  #: why the connection ends, once either end has given a reason
         self.topics: set[str] = set()
 
