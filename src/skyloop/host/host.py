@@ -51,8 +51,8 @@ Announce = Callable[[str], None]
 class Host:
     """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
 
-    ``announce``: called with a line of text for users when a vehicle joins, fails or leaves. ``make``: creates the
-    driver for an address; used for vehicles in this process.
+    ``announce`` is called with a line of text for users when a vehicle joins, fails or leaves. ``make`` creates the
+    driver for the address of a vehicle in this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:

@@ -50,8 +50,8 @@ def pause_s(deaths: int) -> float:
 class OwnProcessVehicle(HostedVehicle):
     """A vehicle with ``process = "own"``, whose driver can harm only its own process.
 
-    ``announce``: called with a line of text for users when its process dies and when it is restarted. ``command``:
-    starts the process; the name is appended, and the settings are passed separately.
+    ``announce`` is called with a line of text for users when the process dies and when it is restarted. ``command``
+    starts the process; the vehicle's name is appended, and its settings are passed separately.
     """
 
     def __init__(

@@ -110,9 +110,9 @@ class HostedVehicle(ABC):
 class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
-    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, ``network`` is None for this host only.
-    ``overview``: returns the rows of all vehicles in this process; None: only its own row is shown. ``serve_link``:
-    moves a driver's link to a shared thread; None: the link keeps its own.
+    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, and ``network`` is None for this host
+    only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's row is shown.
+    ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
     """
 
     def __init__(

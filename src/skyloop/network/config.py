@@ -94,7 +94,7 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """How much longer than by default silence is tolerated [s]."""
+        """Time that silence is tolerated beyond the default [s]."""
         return self.lease_s - LEASE_S
 
     @property

@@ -244,7 +244,7 @@ class FramePublisher:
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
-        """Wait until a variant has readers due for its newest frame; return all three (readers None: all of them).
+        """Wait until a variant's newest frame is due for readers; return variant, frame and readers (None: all).
 
         None at the end, or if the camera has no readers.
         """

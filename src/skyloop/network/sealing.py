@@ -29,7 +29,7 @@ KEY_BYTES: Final = 32
 #: How many packets late a packet may arrive: datagrams can overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
 GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
-#: How long after sending a new topic key it is first used, so that it arrives before the first packet sealed with it.
+#: Delay between sending a new topic key and first using it, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 
 

@@ -67,7 +67,7 @@ class ActionExecutor:
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may fly: if it never reports its state, from the first command on."""
+        """Whether the vehicle flies or may fly; without a reported state, it may from the first command on."""
         return self.flight.flies(self.state)
 
     @property
@@ -218,7 +218,7 @@ class ReturnSupervisor:
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
         """Observe the start, and fly back if the ladder requires it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's own; a vehicle flown by others is not returning for us.
+        ``ours``: whether the flight is the proxy's own; a vehicle flown by others does not return on our behalf.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)

@@ -88,7 +88,7 @@ class CommandHandler(FlightSupervisor):
                 self._executor.autopilot.settings = settings.autopilot
 
     def problem_with_ceiling(self, altitude: float) -> str:
-        """Return why ``limits.altitude`` must not be lowered to this height [m] now, as text; empty if it may."""
+        """Return a readable reason not to lower ``limits.altitude`` to this height [m] now; empty if there is none."""
         with self._lock:
             flies = self._executor.airborne
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""

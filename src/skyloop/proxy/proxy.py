@@ -77,10 +77,10 @@ _log = logging.getLogger(__name__)
 class Proxy:
     """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
 
-    Applications connect by ``name``, of 1 to 64 characters; ``clock`` is that of all samples [ns]. ``ticker=False``:
-    the caller calls :meth:`tick`, as for many proxies in a process, tests, or simulated time. ``jobs``: answers
-    requests that may wait for the vehicle; by default on a separate thread. ``slept``: returns how long the computer
-    has slept in total [ns]; by default the system's, if the clock is.
+    Applications connect by ``name``, which has 1 to 64 characters. ``clock`` gives the time of all samples [ns]. With
+    ``ticker=False``, the caller calls :meth:`tick`, for example for many proxies in a process, or in simulated time.
+    ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept`` returns how long
+    the computer has slept in total [ns]; the default is the system's if ``clock`` is.
     """
 
     def __init__(
@@ -238,10 +238,10 @@ class Proxy:
         time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
-        without the proxy is still landed, however long it takes, because otherwise it would fall. ``unless_flying``: if
-        the vehicle does not land in time, the landing continues, and so does the proxy. ``hangs``: the driver hangs or
-        fails, so nothing waits for it, and it is not asked to land or hover: calls that may hang are left to daemon
-        threads, as if the proxy had been killed.
+        without the proxy is still landed, however long it takes, because otherwise it would fall. With
+        ``unless_flying``, the landing and the proxy continue if the vehicle does not land in time. With ``hangs``, the
+        driver hangs or fails: nothing waits for it, it is not asked to land or hover, and calls that may hang are left
+        to daemon threads, as if the proxy had been killed.
 
         Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done; if
         the driver hangs, errors are logged instead.

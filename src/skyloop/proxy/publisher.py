@@ -58,9 +58,9 @@ class VehiclePublisher:
     It acquires no lock that is held while the driver is called, so a driver may call it on any thread, even
     re-entrantly.
 
-    ``state_of``: returns the flight state, given the driver's, because the software autopilot may know better.
-    ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the secrets in
-    the vehicle's address from a text.
+    ``state_of`` returns the flight state, given the driver's, because the software autopilot may know better.
+    ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
+    in the vehicle's address from a text.
     """
 
     def __init__(

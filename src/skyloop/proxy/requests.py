@@ -181,7 +181,7 @@ class RequestDispatcher:
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current job; if the driver hangs for longer, it is left to its daemon thread."""
+        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:

@@ -144,8 +144,8 @@ def run(
     Starts the proxies, and stops them at the end; writes lines for each, as :func:`serve` does. ``audit``: file for the
     audit trail; by default each proxy has one in the user's state directory, except private ones (with ``parent_fd``).
     ``records``: whether to keep an audit trail, and a note about the flight for the next run; by default, private
-    proxies keep none, because they are never restarted under their name. ``beside``: a context around the proxies'
-    life.
+    proxies keep none, because they are never restarted under their name. ``beside``: a context entered while the
+    proxies run.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -227,8 +227,8 @@ def at_once(
 ) -> None:
     """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
-    ``tell``: called with the ones for which there is no thread, before they are run one after another. ``over``:
-    returns whether to stop waiting for one. ``daemon``: whether the program may end before they do.
+    ``tell``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
+    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may end before they do.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
@@ -240,7 +240,7 @@ def at_once(
     for one in left:
         try:
             tell(one)
-        except Exception:  # noqa: BLE001 ends are still called
+        except Exception:  # noqa: BLE001 the ends are called regardless
             _log.exception("could not report that several flights end one after another")
     for one in left:
         ends[one]()

@@ -63,15 +63,15 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
 _NOTICED_M_S: Final = 0.05  #: reductions of the software autopilot's steps that are smaller than this are not reported
-#: Minimum additional sleep of the computer that counts; less can't be distinguished from a delay.
+#: Minimum additional sleep time of the computer that is handled; less can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
 class FlightSupervisor:
     """Supervises the authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections, by number of the application; read here and changed by the proxy. ``slept``: returns
-    how long the computer has slept in total [ns].
+    ``sessions``: the connections by application number, read here and changed by the proxy. ``slept``: returns how long
+    the computer has slept in total [ns].
     """
 
     def __init__(
@@ -357,7 +357,7 @@ class FlightSupervisor:
     # Authority ----------------------------------------------------------------------------------------------------
 
     def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Hover while the authority changes hands, then publish ``news`` and the changes."""
+        """Hover while the authority changes hands, then publish the events in ``news`` and the changes."""
         for effect in effects:
             if not isinstance(effect, Lost | Preempted | Granted):
                 continue

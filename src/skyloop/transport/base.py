@@ -124,8 +124,8 @@ class TransportServer(ABC):
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
         """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
 
-        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, else :class:`UsageError` is raised;
-        they may be reused after the call.
+        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, otherwise :class:`UsageError` is
+        raised; they may be reused after the call.
         """
 
     @abstractmethod

@@ -260,7 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial; raise ``LinkError`` also for an unknown name, which raises ``UsageError`` and is equally valid."""
+        """Dial; convert the error for an unknown name (``UsageError``), which is equally valid, to ``LinkError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

@@ -181,7 +181,7 @@ def page_certificate(
     """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
 
     ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
-    names given by the user, which it must be able to certify.
+    names given by the user, which the authority must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now
     make_directory(directory.parent)

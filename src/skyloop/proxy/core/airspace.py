@@ -144,9 +144,9 @@ class Airspace:
     ) -> Verdict:
         """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
 
-        ``new``: a permitted target stays permitted while nothing else is requested: if drift puts an obstacle in the
-        way, the steps avoid it; a lower ceiling lowers the target. ``planned``: it is part of a route that was checked
-        as a whole, and so may be lowered from the start.
+        Unless the request is ``new``, a permitted target stays permitted: the steps avoid an obstacle that drift puts
+        in the way, and a lower ceiling lowers the target. ``planned``: whether the target is part of a route that was
+        checked as a whole, and so may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):

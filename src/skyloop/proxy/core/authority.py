@@ -16,7 +16,7 @@ from skyloop.clock import nanoseconds
 
 @dataclass(frozen=True, slots=True, order=True)
 class QueueEntry:
-    """An application that holds the authority or waits for it. Entries sort in the order in which they get it."""
+    """An application that holds or awaits the authority. Entries sort in the order in which they get the authority."""
 
     priority: int  #: 0 is the highest
     arrival: int  #: number of its first request since it was last neither holder nor in the queue

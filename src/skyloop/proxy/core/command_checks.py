@@ -155,7 +155,7 @@ class Intents:
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
         self._floor = -1  # intents up to this one were ended by an event
-        self._ended = Fate.AUTHORITY  # the fate of these intents
+        self._ended = Fate.AUTHORITY  # fate of the intents that the event ended
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
@@ -253,7 +253,7 @@ class CommandChecks:
     """Decides how to handle the commands for one vehicle.
 
     ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
-    ``why_not``: why others are not available, as readable text.
+    ``why_not``: readable reasons why other actions are not available.
     """
 
     def __init__(
@@ -276,8 +276,8 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: What a person may command while nothing is received from the vehicle: it may still receive us, and otherwise
-        #: only the emergency stop could bring it down.
+        #: Actions that a person may command while nothing is received from the vehicle. It may still receive us, and
+        #: otherwise only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
@@ -303,7 +303,7 @@ class CommandChecks:
         if new and kind is ReturnToStart:
             self.way_back = None
         if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
-            policy = StatePolicy.HOLD  # already landing, which an automatic hover does not abort
+            policy = StatePolicy.HOLD  # an automatic hover does not abort a landing
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
@@ -347,8 +347,8 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Return whether the vehicle's position matters: to a hover in flight, or to a take-off from the ground."""
-        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take it back
+        """Return whether the position matters: it does for hovers in flight and for take-offs from the ground."""
+        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take over control
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 

@@ -68,7 +68,7 @@ class FailsafeInputs:
     battery: float | None
     ours: bool = True  #: whether an application of this proxy started the flight or took it over
     return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
-    shown: bool = True  #: whether the state is current; False: the last one from a vehicle that is no longer received
+    shown: bool = True  #: whether the state is current; False: the last state of a vehicle no longer received
 
 
 @dataclass(frozen=True, slots=True)

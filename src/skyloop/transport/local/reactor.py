@@ -374,7 +374,7 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # it connected while the others were being disconnected
+            if self._stopping.is_set():  # connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:

@@ -95,7 +95,7 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long calls block [s], by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; after that, ``EAGAIN``; 0: no limit."""
+    """Limit how long calls block [s] before ``EAGAIN``, by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; 0: no limit."""
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
@@ -126,7 +126,7 @@ class ServerConnection:
         return self._socket.fileno()
 
     def more(self) -> bool:
-        """Return whether a pilot's packet, or the end, is waiting in the socket; others can't command anyway."""
+        """Return whether a pilot's packet, or the end, is waiting in the socket; other clients can't command anyway."""
         return self.pilot and bool(self.poll(0))
 
     def take_in(self) -> int:
