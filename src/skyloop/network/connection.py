@@ -241,7 +241,7 @@ class Publisher:
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))

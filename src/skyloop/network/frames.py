@@ -24,10 +24,10 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: number of frames in flight to one reader
-#: Forms of one camera's frames. Each form is encoded separately; a form split into n parts costs no more than a whole
-#: one. The default forms are not counted, which leaves room for a pilot whatever others request.
+#: Formats of one camera's frames. Each is encoded separately; a format split into n parts costs no more than a whole
+#: one. The default formats are not counted, which leaves room for a pilot whatever others request.
 MAX_FORMS: Final = 32
-MAX_FORMS_EACH: Final = 8  #: number of forms that one connection may read
+MAX_FORMS_EACH: Final = 8  #: number of formats that one connection may read
 #: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
@@ -79,7 +79,7 @@ class Reader:
 
 
 class Variant:
-    """One form of a camera's frames, and its readers."""
+    """One format of a camera's frames, and its readers."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
@@ -136,7 +136,7 @@ class FramePublisher:
         return missed
 
     def readers(self, camera: str) -> int:
-        """Return the number of subscriptions to a camera, in all forms."""
+        """Return the number of subscriptions to a camera, in all formats."""
         with self._changed:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
@@ -278,7 +278,7 @@ class FramePublisher:
 
 
 def _cost(request: VideoRequest) -> float:
-    """Return the fraction of frames that must be encoded for a form."""
+    """Return the fraction of frames that must be encoded for a format."""
     return 1.0 if request.part is None else 1.0 / request.part[1]
 
 

@@ -101,7 +101,7 @@ def topic(name: str, topic_name: str) -> str:
 
 def newest_wins(topic_name: str) -> bool:
     """Return whether only a topic's newest packet counts, so that it may be lost and never waits for earlier ones."""
-    return topic_name.partition("?")[0] == FEEDBACK  # feedback in any form
+    return topic_name.partition("?")[0] == FEEDBACK  # feedback in any variant
 
 
 def video(name: str, camera: str, variant: str = "") -> str:

@@ -149,7 +149,7 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:

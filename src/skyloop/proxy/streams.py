@@ -1,8 +1,9 @@
-"""Encode H.264 as subscribers request it: each form once, on a separate thread, for all of its subscribers.
+"""Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
-A form with a fixed rate is shared by all that request it. A form named after a subscriber is for that subscriber alone;
-its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle
-itself sends H.264, such a form forwards it unchanged while the path can carry it, and otherwise encodes.
+A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
+alone; its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
+vehicle itself sends H.264, such a stream forwards it unchanged while the path can carry it, and is otherwise encoded
+here.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from skyloop.transport.frame_encoding import resized_header
 
 MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
 KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requests for key frames
-IDLE_S: Final = 1.0  #: a form ends its thread after this time without subscribers
+IDLE_S: Final = 1.0  #: a stream ends its thread after this time without subscribers
 GOOD_BITS: Final = 0.2  #: bits per pixel beyond which images hardly improve
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
@@ -55,7 +56,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
+    """One camera's H.264 in one format; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
 
     def __init__(
         self,
@@ -99,7 +100,7 @@ class StreamForm:
         self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0: unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # a time, so that a recreated form continues with higher numbers
+        self._seq = clock() // 1_000_000  # a time, so that a recreated stream continues with higher numbers
 
     @property
     def passing(self) -> bool:
@@ -108,7 +109,7 @@ class StreamForm:
 
     @property
     def max_fps(self) -> float:
-        """Maximum rate at which the form uses frames; infinity if it uses all."""
+        """Maximum rate at which the stream uses frames; infinity if it uses all."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
@@ -153,7 +154,7 @@ class StreamForm:
         """Handle a subscriber's report: its newest frame, and whether it needs a key frame."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
-            # A number that this form never sent would distort the measurement of the path.
+            # A number that this stream never sent would distort the measurement of the path.
             if self._rate is not None and report.seq <= self._seq:
                 self._rate.acknowledged(report.seq, now_ns)
 
@@ -276,7 +277,7 @@ class StreamForm:
 
 
 class Streams(Forms[StreamForm]):
-    """All forms of a vehicle's cameras."""
+    """All encoded streams of a vehicle's cameras."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
         super().__init__(MAX_FORMS, server.subscribers, clock)
@@ -285,7 +286,7 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a form can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
+        """Return why a format can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
                 f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "
@@ -305,7 +306,7 @@ class Streams(Forms[StreamForm]):
         )
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the highest frame rate among those of this camera's encoded forms that have subscribers."""
+        """Return the highest frame rate among this camera's encoded streams that have subscribers."""
         watched = (
             one.max_fps
             for one in self.known
@@ -314,13 +315,13 @@ class Streams(Forms[StreamForm]):
         return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
-        """Return whether any form may forward the vehicle's own stream from this camera."""
+        """Return whether any format may forward the vehicle's own stream from this camera."""
         return any(
             one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in self.known
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for the forms that need it, copying it once if any do."""
+        """Queue a frame for the streams that need it, copying it once if any do."""
         camera = header.camera
         wanted = [
             form
@@ -334,7 +335,7 @@ class Streams(Forms[StreamForm]):
             form.put(header, copy)
 
     def own(self, picture: EncodedFrame) -> None:
-        """Publish a frame encoded by the vehicle, unchanged and in the forms that forward it."""
+        """Publish a frame encoded by the vehicle, unchanged and in the streams that forward it."""
         self.publish(picture)
         for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:

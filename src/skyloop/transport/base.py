@@ -220,7 +220,7 @@ class TransportClient(ABC):
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive in the form that each topic requests (:class:`skyloop.messages.VideoRequest`).
+        """Whether frames arrive in the format that each topic requests (:class:`skyloop.messages.VideoRequest`).
 
         If not, all frames arrive unchanged, and each camera has only its plain topic.
         """
