@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Those that are absent are exported
-#: as 0, except those of a network that is not served.
+#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported as 0,
+#: except those of a network that is not served.
 _COUNTERS: Final = (
     *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
     *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),

@@ -134,7 +134,7 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: at the same time; another connection closes the one that has waited longest without a request
+MAX_SCRAPES: Final = 8  #: simultaneous scrapes; one more closes the connection that has waited longest for its request
 ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop

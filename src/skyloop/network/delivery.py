@@ -207,7 +207,7 @@ class Receiver:
     """Receives packets at one end of a connection: numbered ones exactly once and in order, all others at most once.
 
     The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
-    other packets are passed to ``deliver``. Thread-safe: for numbered packets, only one thread at a time calls either.
+    other packets are passed to ``deliver``. Thread-safe; numbered packets are passed on by one thread at a time.
     """
 
     def __init__(self) -> None:

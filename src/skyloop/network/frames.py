@@ -180,10 +180,10 @@ class FramePublisher:
             return ""
         mine = [known for known, variant in variants.items() if key in variant.readers and variant.request not in usual]
         if len(mine) >= MAX_FORMS_EACH:
-            return f"a connection reads at most {MAX_FORMS_EACH} forms of a camera beside the default: {_listed(mine)}"
+            return f"a connection gets at most {MAX_FORMS_EACH} formats per camera besides the default: {_listed(mine)}"
         others = {known: variant.request for known, variant in variants.items() if variant.request not in usual}
         if topic not in variants and sum(map(_cost, others.values())) + _cost(request) > MAX_FORMS:
-            return f"a camera's frames are encoded in at most {MAX_FORMS} forms: choose one of {_listed(others)}"
+            return f"a camera's frames are encoded in at most {MAX_FORMS} formats: choose one of {_listed(others)}"
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:

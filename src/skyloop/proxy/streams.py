@@ -2,8 +2,7 @@
 
 A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
 alone; its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a stream forwards it unchanged while the path can carry it, and is otherwise encoded
-here.
+vehicle itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
 from __future__ import annotations
@@ -301,7 +300,7 @@ class Streams(Forms[StreamForm]):
                 form.asked()
             return ""
         return (
-            f"this proxy encodes video in at most {MAX_FORMS} forms at a time, and all are in use: subscribe to one of "
+            f"this proxy encodes video in at most {MAX_FORMS} formats, and all are in use: subscribe to one of "
             f"{', '.join(form.topic for form in self.known if not form.request.subscriber) or 'its frames as JPEG'}"
         )
 

@@ -140,7 +140,7 @@ class FeedbackVariants(Forms[_Variant]):
         if self.claim(topic, lambda: _Variant(topic, request)):
             return ""
         return (
-            f"this proxy sends feedback in at most {MAX_VARIANTS} forms at a time, and all are in use: "
+            f"this proxy sends feedback in at most {MAX_VARIANTS} variants at a time, and all are in use: "
             f"subscribe to {FEEDBACK}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
         )
 

@@ -101,7 +101,7 @@ def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
 
 
 class ServerConnection:
-    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread."""
+    """An application's connection. Any thread may send without waiting; everything else is for its receiving thread."""
 
     def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
