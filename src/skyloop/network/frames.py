@@ -92,7 +92,7 @@ class FramePublisher:
     """Publishes the frames of all of a server's cameras. Thread-safe; copies, encodes and sends outside its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
-        #: Returns why a topic can't be subscribed to; empty if it can.
+        #: Returns why a topic can't be subscribed to, or an empty string if it can be.
         self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send
         self._name = name
@@ -161,7 +161,7 @@ class FramePublisher:
         return True
 
     def problem(self, key: Hashable, topic: str) -> str:
-        """Return why a connection can't have these frames; empty if it can."""
+        """Return why a connection can't have these frames, or an empty string if it can."""
         with self._changed:
             return self._problem(key, topic)
 

@@ -1,4 +1,4 @@
-"""The command handler: executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler, which executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 

@@ -261,7 +261,7 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # these run from last to first, even if others raise
+        with ExitStack() as steps:  # the steps run from last to first, even if others raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
@@ -374,7 +374,7 @@ class Proxy:
         )
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to; empty if it can."""
+        """Return why a topic can't be subscribed to, or an empty string if it can be."""
         return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:

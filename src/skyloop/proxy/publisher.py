@@ -278,7 +278,7 @@ class VehiclePublisher:
         return {*self._cameras, *self._frame_seq.copy()}
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to; empty if it can. Thread-safe."""
+        """Return why a topic can't be subscribed to, or an empty string if it can be. Thread-safe."""
         if topic.startswith(PREFIX):
             return self.variants.problem(topic)
         problem = topic_problem(topic, self.cameras)

@@ -47,7 +47,7 @@ _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, naming the available ones; empty if it can.
+    """Return why a topic can't be subscribed to, naming the available ones; an empty string if it can be.
 
     A processor's results may be subscribed to before it has a worker.
     """

@@ -246,7 +246,7 @@ class SharedLocalServer(LocalServer):
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
         super().__init__(name, group=group)
-        self.reactor = reactor  #: the reactor that receives for it at present
+        self.reactor = reactor  #: the reactor that currently receives for this server
         self._handler: ServerHandler | None = None
         self._listening: Source | None = None
         self._inode = 0

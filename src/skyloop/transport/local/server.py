@@ -38,7 +38,7 @@ from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_comman
 MAX_CLIENTS: Final = 128
 #: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: the same per user with access through a group; the proxy's own user may use all others
+MAX_PER_USER: Final = 64  #: maximum per user with access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: places reserved for pilots
 HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send when they connect
 _RETRY_ACCEPT_S: Final = 0.2
