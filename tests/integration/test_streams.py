@@ -265,7 +265,7 @@ def test_the_number_of_forms_is_bounded(near: Drone) -> None:
     with near.on_event(lambda event: problems.put(event.text) if event.kind == "packet_malformed" else None):
         for watch in watches:
             watch.__enter__()
-        assert f"encodes video in at most {MAX_FORMS} forms" in problems.get(timeout=WAIT_S)
+        assert f"encodes video in at most {MAX_FORMS} formats" in problems.get(timeout=WAIT_S)
     for watch in watches[:-1]:
         assert watch.take(1)[0].key
     for watch in watches:

@@ -1,4 +1,4 @@
-"""Feedback in the forms that subscribers request: no more than requested, encoded once, bounded in number."""
+"""Feedback in the variants that subscribers request: no more than requested, encoded once, bounded in number."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_forms_are_bounded_and_released_when_unused(bench: Bench) -> None:
     late.end.subscribe(one_more)
     late.sync()
     (told,) = late.told(EventKind.PACKET_MALFORMED)
-    assert f"at most {MAX_VARIANTS} forms" in told.text
+    assert f"at most {MAX_VARIANTS} variants" in told.text
     late.end.subscribe("feedback?max_hz=3")  # a form already in use is available to all
     late.sync()
     assert len(late.told(EventKind.PACKET_MALFORMED)) == 1

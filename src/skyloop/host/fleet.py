@@ -18,7 +18,7 @@ from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
 HOST: Final = "host"  #: default name of a host
-#: Schemes of addresses that create a vehicle, so that two vehicles may have the same address.
+#: Schemes whose addresses each create a new vehicle, so that two vehicles may have the same address.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")
@@ -37,7 +37,7 @@ class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unkno
 class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """``[defaults]``: settings for each vehicle that does not override them."""
 
-    network: Text | None = None  #: like ``--network`` of ``skyloop proxy``; ``off`` for this host only
+    network: Text | None = None  #: the same as ``--network`` of ``skyloop proxy``; ``off``: this host only
     listen: list[str] | None = None
     multicast: bool | None = None  #: whether multicast discovery is used if ``network`` includes it
     keys: Text | None = None  #: an identity's folder
@@ -98,7 +98,7 @@ class Fleet(msgspec.Struct, frozen=True):
 
     name: str
     vehicles: tuple[VehicleSettings, ...]
-    defaults: Defaults  #: for vehicles added by address
+    defaults: Defaults  #: the defaults for vehicles added by address
 
 
 def read_fleet(path: Path) -> Fleet:

@@ -1,4 +1,4 @@
-"""The host: any number of vehicles in one process, which can fail, join and leave without affecting the others."""
+"""The host, which runs any number of vehicles in one process; each can fail, join or leave without affecting others."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ Announce = Callable[[str], None]
 class Host:
     """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
 
-    ``announce``: called with a line of text for users when a vehicle joins, fails or leaves. ``make``: creates the
-    driver for an address; used for vehicles in this process.
+    ``announce`` is called with a line of text for users when a vehicle joins, fails or leaves. ``make`` creates the
+    driver for the address of a vehicle in this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
@@ -62,7 +62,7 @@ class Host:
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
         self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
-        self._reactor = Reactor()  # used for vehicles that join
+        self._reactor = Reactor()  # the reactor for vehicles that are added
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -136,8 +136,8 @@ class Host:
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
         """Land a vehicle, end its proxy and forget it; return its last status.
 
-        Raises :class:`RefusedError` and does not remove it if it flies under a lease (code ``flown``), unless it is to
-        ``land`` nevertheless, or has not landed within ``timeout_s`` [s] (``flying``).
+        Raises :class:`RefusedError` and does not remove the vehicle if it flies under a lease (code ``flown``) and
+        ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -189,7 +189,7 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks."""
+        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks it."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
@@ -213,10 +213,10 @@ class Host:
     def close(
         self, reason: str = "the host was stopped", within_s: float = 0.0, hurry: Callable[[], bool] = lambda: False
     ) -> None:
-        """End all flights, landing for up to ``within_s`` [s], proxies, and threads that are not stuck. Idempotent.
+        """End all flights (landing for up to ``within_s`` [s]), proxies, and threads that are not stuck. Idempotent.
 
         ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
-        does Ctrl-C if nothing else handles it; it is raised at the end.
+        does Ctrl-C if nothing else handles it; ``KeyboardInterrupt`` is then raised at the end.
         """
         with self._lock:
             self._closing = True

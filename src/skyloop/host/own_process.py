@@ -50,8 +50,8 @@ def pause_s(deaths: int) -> float:
 class OwnProcessVehicle(HostedVehicle):
     """A vehicle with ``process = "own"``, whose driver can harm only its own process.
 
-    ``announce``: called with a line of text for users when its process dies and when it is restarted. ``command``:
-    starts the process; the name is appended, and the settings are passed separately.
+    ``announce`` is called with a line of text for users when the process dies and when it is restarted. ``command``
+    starts the process; the vehicle's name is appended, and its settings are passed separately.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class OwnProcessVehicle(HostedVehicle):
         self._announce = announce
         self._changed = threading.Condition()  # guards all of the following
         self._reported: VehicleStatus | None = None  # status reported by the current process
-        self._silent_checks = 0  # checks since it last sent a report
+        self._silent_checks = 0  # number of checks since it last sent a report
         self._deaths = 0  # number of deaths in succession
         self._runner = RestartingChild(
             [*command, settings.name],

@@ -43,7 +43,7 @@ _POLL_S: Final = 0.2  # interval between checks for signals and changes
 MAX_REQUEST: Final = 1 << 22  #: maximum size in bytes, sent in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: maximum size in bytes
 MAX_ANSWER: Final = 1 << 22  #: maximum size in bytes
-ANSWERS_WITHIN_S: Final = 60.0  #: includes the landing before a removal
+ANSWERS_WITHIN_S: Final = 60.0  #: time for an answer, including the landing before a removal
 _CHUNK: Final = 1 << 15  # size of a packet in bytes
 _AGAIN_S: Final = 0.1  # pause after a failed accept
 _SLOW_S: Final = 2.0  # time for the other end to receive or send a packet
@@ -81,7 +81,7 @@ def serve(
         polls = _key_changes(fleet)
         gc.collect()
         gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
-        # Poll, because the kernel may deliver a signal to any thread, which does not wake this one.
+        # Poll, because the kernel may deliver a signal to another thread, and that does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -153,7 +153,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
     """Return a source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # a folder that could not be served
+        with suppress(UsageError, ImportError):  # a folder whose vehicle could not be served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
@@ -274,7 +274,7 @@ class ControlServer:
         received = bytearray()
         while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
             received += packet
-            if len(packet) != _CHUNK:  # it was the last packet
+            if len(packet) != _CHUNK:  # that was the last packet
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)

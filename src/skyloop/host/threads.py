@@ -22,11 +22,11 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Failed ticks in succession (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: A proxy does everything once in this many rounds, which is ten times a second.
+#: Number of rounds after which a proxy does everything again, ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called on the ticker's thread with a proxy whose ticks fail and the last error; must return immediately.
+#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing; must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
 MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
 IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
@@ -52,13 +52,13 @@ class Ticker:
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
         self._failures = dict.fromkeys(proxies, 0)  # number of failures in succession, by proxy
-        self._lock = threading.Lock()  # guards the knowledge of whose code is running
+        self._lock = threading.Lock()  # guards what is known about whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
 
     def add(self, proxy: Proxy) -> None:
-        """Tick a proxy from now on. Any thread."""
+        """Start ticking a proxy. Any thread."""
         with self._lock:
             self._failures[proxy] = 0
 
@@ -90,9 +90,9 @@ class Ticker:
         for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
-            for place, proxy in enumerate(proxies, rounds):  # a fifth of them per round, to spread the work
+            for place, proxy in enumerate(proxies, rounds):  # a fifth of the sockets per round, to spread the work
                 failures = self._failures.get(proxy)
-                if failures is not None:  # no other ticker has taken it over
+                if failures is not None:  # no other ticker has taken over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
 
@@ -223,7 +223,7 @@ class SharedLoop(Protocol):
 
     @property
     def inside(self) -> Any:
-        """Whose code is currently running; None if there is none."""
+        """The object whose code is currently running, or None."""
 
     @property
     def entries(self) -> int:
@@ -254,7 +254,7 @@ class Watchdog:
         self._loops = loops
         self._on_stall = on_stall
         self._on_hang = on_hang
-        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and number of checks without a change
+        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # number of entries, and number of checks without a change
         self._checked_s = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-watchdog", daemon=True)
@@ -283,7 +283,7 @@ class Watchdog:
                 act = self._on_stall if checks == STALL_CHECKS else self._on_hang
                 try:
                     act(loop, inside)
-                except Exception:  # noqa: BLE001  it must keep checking
+                except Exception:  # noqa: BLE001 the checks must continue
                     _log.exception("handling a vehicle that hangs failed")
         self._seen = seen
 
@@ -295,9 +295,9 @@ class Watchdog:
 class LinkThread:
     """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
 
-    One thread for all, because with a thread for each, most time would go to switching threads. Commands bypass it:
-    they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows
-    whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
+    One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
+    it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
+    shows whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
@@ -307,10 +307,10 @@ class LinkThread:
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards the knowledge of whose code is running
+        self._lock = threading.Lock()  # guards what is known about whose code is running
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
-        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with other times are stale
+        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with outdated times are stale
         self._order = count()  # breaks ties between due times
         self._paused: set[ServedLink] = set()  # links that are not polled because of an error
         self._closing = False
@@ -359,7 +359,7 @@ class LinkThread:
             self._selector.unregister(link)
 
     def _plan(self, link: ServedLink, due_ns: int) -> None:
-        """Schedule a link to be served by the given time. The lock must be held."""
+        """Schedule a link to be served by the given time. The caller holds the lock."""
         if self._due_ns.get(link) == due_ns:
             return
         self._due_ns[link] = due_ns
@@ -369,18 +369,18 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due, or None if there is none. The lock must be held."""
+        """Return when the next link is due, or None if there is none. The caller holds the lock."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
         return queue[0][0] if queue else None
 
     def _due(self, now_ns: int) -> set[ServedLink]:
-        """Return the links that are due. The lock must be held."""
+        """Return the links that are due. The caller holds the lock."""
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
-            del self._due_ns[link]  # until it has been served
+            del self._due_ns[link]  # absent until it has been served
             due.add(link)
         return due
 
@@ -414,7 +414,7 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread has taken it over in the meantime
+                return  # another thread has taken over since then
             if link in self._paused:
                 self._paused.remove(link)
                 readable = True  # it may be readable: it was not polled

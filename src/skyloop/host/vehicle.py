@@ -71,9 +71,9 @@ class HostedVehicle(ABC):
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
         self.condition = Condition.STOPPED
-        self.failed = ""  #: the reason, if it has failed
+        self.failed = ""  #: why it has failed; empty if it has not
         self.started_s = time.monotonic()
-        self.proxy: Proxy | None = None  #: while it serves in this process
+        self.proxy: Proxy | None = None  #: set while the vehicle is served in this process
 
     @abstractmethod
     def start(self) -> None:
@@ -94,7 +94,7 @@ class HostedVehicle(ABC):
 
     @property
     def runs(self) -> bool:
-        """Return whether it has a proxy or is about to have one."""
+        """Return whether the vehicle has a proxy or is about to have one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
@@ -110,9 +110,9 @@ class HostedVehicle(ABC):
 class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
-    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, ``network`` is None for this host only.
-    ``overview``: returns the rows of all vehicles in this process; None: only its own row is shown. ``serve_link``:
-    moves a driver's link to a shared thread; None: the link keeps its own.
+    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, and ``network`` is None for this host
+    only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's row is shown.
+    ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class SharedVehicle(HostedVehicle):
         self._jobs = jobs
         self._network = network
         self._life = threading.Lock()  # guards starting, failing and stopping
-        self._settled = threading.Event()  # set when it runs or has failed to start
+        self._settled = threading.Event()  # set when the vehicle is running or has failed to start
 
     def start(self) -> None:
         try:
@@ -199,7 +199,7 @@ class SharedVehicle(HostedVehicle):
         self, within_s: float, reason: str, hurry: Callable[[], bool] = lambda: False, *, unless_flying: bool = False
     ) -> bool:
         if self.condition is not Condition.STOPPED:
-            self._settled.wait(OPEN_S + 1.0)  # otherwise it might start to serve after its removal
+            self._settled.wait(OPEN_S + 1.0)  # otherwise it might start serving after its removal
         proxy = self.proxy
         if proxy is not None and self.condition is Condition.RUNNING:
             patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)
@@ -243,7 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run something that may hang on a separate thread, and raise its exceptions here.
 
-    Returns whether the call returned in time. If not, its daemon thread keeps running.
+    Returns whether the call returned in time. Otherwise, the daemon thread keeps running.
     """
     raised: list[BaseException] = []
 

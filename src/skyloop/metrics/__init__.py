@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent ones are 0, except those of
-#: a network that is not served.
+#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported as 0,
+#: except those of a network that is not served.
 _COUNTERS: Final = (
     *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
     *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
@@ -38,7 +38,7 @@ _LABELLED: Final = {
     "skyloop_frames_missed_total": ("frames.", ".missed"),
 }
 _DELAYS: Final = {"median": "commands.delay.median_s", "p99": "commands.delay.p99_s", "max": "commands.delay.max_s"}
-__all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # what is passed on from the endpoint
+__all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # re-exported from the endpoint
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:

@@ -51,7 +51,7 @@ _CHANNEL: Final = ("vehicle", "channel")
 FAMILIES: Final[dict[str, Family]] = {
     family.name: family
     for family in (
-        # For each proxy; the label `vehicle` is the proxy's name.
+        # Metrics of each proxy; the label `vehicle` is the proxy's name.
         Family("skyloop_vehicle_info", "info", ("vehicle", "family"), "the vehicle's family"),
         Family("skyloop_vehicle_state", "gauge", ("vehicle", "state"), "1 for the current flight state, else 0"),
         Family(
@@ -103,7 +103,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
         Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
         Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),
-        # For the cockpit, as a client of each proxy.
+        # Metrics of the cockpit, which is a client of each proxy.
         Family(
             "skyloop_client_link_state",
             "gauge",
@@ -123,10 +123,10 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_client_age_seconds", "gauge", _CHANNEL, "age of the newest sample"),
         Family("skyloop_cockpit_unreachable", "gauge", (), "discovered proxies that can't be connected to"),
         Family("skyloop_cockpit_pilots", "gauge", _VEHICLE, "pages that have or await the authority, or may stop"),
-        # For a router.
+        # Metrics of a router.
         Family("skyloop_router_links", "gauge", ("kind",), "links to others: router, peer (a proxy), client"),
         Family("skyloop_router_shut_out", "gauge", (), "linked nodes whose keys were revoked or changed"),
-        # For every endpoint.
+        # Metrics of each endpoint.
         Family("skyloop_scrape_errors_total", "counter", (), "readings that failed and are missing, see the log"),
     )
 }
@@ -134,7 +134,7 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: at a time; a further connection closes the one that has waited longest without a request
+MAX_SCRAPES: Final = 8  #: simultaneous scrapes; one more closes the connection that has waited longest for its request
 ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop
@@ -234,7 +234,7 @@ class Collector:
         for source in self._sources():
             try:
                 yield from list(source())
-            except Exception:  # noqa: BLE001  (the others are to be seen all the same)
+            except Exception:  # noqa: BLE001 (the others are still listed)
                 with self._lock:
                     self._errors += 1
                 _log.exception("metrics can't be read")
@@ -315,7 +315,7 @@ class _Server(ThreadingHTTPServer):
             with self._lock:
                 self._open.pop(request, None)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  (as it is called)
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002 (the base class's signature)
         _log.debug("a scrape by %s ended early", client_address, exc_info=True)
 
 
@@ -344,7 +344,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002  (as it is called)
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002 (the base class's signature)
         _log.debug(format, *arguments)
 
 
@@ -357,5 +357,5 @@ def _names_loopback(host: str) -> bool:
 
 
 def _hang_up(request: socket.socket) -> None:
-    with suppress(OSError):  # it is already gone
+    with suppress(OSError):  # the other end is already gone
         request.shutdown(socket.SHUT_RDWR)

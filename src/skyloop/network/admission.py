@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from skyloop.network.keys import Identity, KeyRing
 
 MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
-#: Connections per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
+#: Connections allowed per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
-#: Connections reserved for keys that may fly this drone, so that no number of other keys can lock pilots out.
+#: Connections reserved for keys that may fly this drone, so that other keys, however many, can't lock pilots out.
 FOR_PILOTS: Final = 64
 #: Tokens remembered per key, because a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
@@ -104,9 +104,9 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no room for another connection of ``who``; empty if there is.
+    """Return why there is no room for another connection from ``who``; empty if there is.
 
-    ``present``: the identity behind each connection, and whether that may fly this drone.
+    ``present``: the identity behind each connection, and whether it may fly this drone.
     """
     here = list(present)
     own = sum(other == who for other, _ in here)

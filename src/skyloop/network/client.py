@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
-#: ended before they were re-established: it then takes the new links for additional ones and announces nothing on them.
-#: The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
+#: ended before they were re-established: it then mistakes the new links for additional ones and announces nothing on
+#: them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
 STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
@@ -201,7 +201,7 @@ class Subscription:
             self._enqueue(self, b"", number)
 
 
-#: For the receiving thread: a packet of a topic (None: for this end only; empty: a frame) and its number.
+#: Items for the receiving thread: a packet of a topic (None: sent to this end only; empty: a frame), its number.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
@@ -209,9 +209,9 @@ _WAKE: Final[_Item] = (None, b"", 0)
 class FabricClient(TransportClient):
     """The application's end, created by the dialer from :func:`dial`.
 
-    It releases its session when the connection ends, but not if the constructor raises: :class:`UnknownNameError` if
-    there is no such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]; :class:`LinkError` if
-    it does not admit this application; :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
+    It releases its session when the connection ends, but not if the constructor raises :class:`UnknownNameError` (no
+    such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]), :class:`LinkError` (the proxy
+    does not admit this application) or :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
     """
 
     def __init__(
@@ -231,10 +231,10 @@ class FabricClient(TransportClient):
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # the proxy's run, set once a proxy was asked to admit us
+        self._run = ""  # the proxy's run, set once a proxy has been asked to admit us
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with the declarations for each
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each with its declarations
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None
@@ -357,7 +357,7 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet until it is acknowledged; return False if there is no room for it. The lock must be held."""
+        """Send a packet until it is acknowledged; return False if there is no room. The caller holds the lock."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False
@@ -367,7 +367,7 @@ class FabricClient(TransportClient):
         return True
 
     def _send_due(self) -> None:
-        """Send the packets that are due. The lock must be held."""
+        """Send the packets that are due. The caller holds the lock."""
         for number, packet, way in self._outgoing.due(time.monotonic()):
             self._put(way, packet, number)
 
@@ -534,7 +534,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet; with ``once``, by a datagram, which may be lost."""
+        """Acknowledge a packet; ``once``: in a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return

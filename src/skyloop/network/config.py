@@ -28,10 +28,10 @@ DEFAULT_PORT: Final = 7447  #: Zenoh's default port
 OPEN_MS: Final = 800
 #: The same for addresses given explicitly: all are tried at once, and one may lead to a mobile network, where answers
 #: after an outage are stuck behind old video. An end that gives up just before the last answer leaves a half-open link
-#: at the far end; Zenoh takes the next link for a second one to the same peer and does not repeat declarations on it.
+#: at the far end; Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits to discover others (Zenoh's default). An application that has one address waits only
-#: for its proxy; one that has several must find all proxies with the name.
+#: How long opening a session waits to discover others (Zenoh's default). An application with a single address waits
+#: only for the proxy at that address; one with several must find every proxy with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
 #: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
@@ -60,7 +60,7 @@ class TlsFiles:
 
 @dataclass(frozen=True, slots=True)
 class FabricSettings:
-    """How to join the network; by default by multicast on this host's network segments, without keys.
+    """How to join the network: by default, via multicast on this host's network segments, without keys.
 
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
     (port 7447). Each means both TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC
@@ -77,7 +77,7 @@ class FabricSettings:
     who: str = ANYONE  #: the identity: the certificate's common name
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
     access_control: dict[str, Any] | None = None
-    #: The keys that ``tls`` and ``access_control`` were made from.
+    #: The keys from which ``tls`` and ``access_control`` were made.
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
@@ -94,12 +94,12 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """How much longer than by default silence is tolerated [s]."""
+        """Time that silence is tolerated beyond the default [s]."""
         return self.lease_s - LEASE_S
 
     @property
     def reach(self) -> str:
-        """Where proxies are searched for, as text for users."""
+        """Text for users that says where proxies are searched for."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 
@@ -169,7 +169,7 @@ def serving(
     """Return the network settings for a proxy, a host or a router.
 
     ``network``: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
-    ``multicast=False`` forbids it nevertheless. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
+    ``multicast=False`` forbids multicast in any case. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -222,10 +222,10 @@ class Part(StrEnum):
 
 #: Signs of life per lease: enough for some to arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
-#: Messages queued for sending, by priority (Zenoh's maximum). By default Zenoh queues 2, and drops further ones within
-#: a millisecond: ten drones in one process can report the same event at the same moment.
+#: Messages queued for sending, by priority (Zenoh's maximum). Zenoh's default of 2 drops further ones within a
+#: millisecond, and ten drones in one process can report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Override what a neighbour requests: no reader is blocked by a slow one, neither here nor through a router. Answers
+#: Override what a neighbour requests, so that no slow reader blocks another, neither here nor through a router. Answers
 #: are sent in the same way as their queries.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
@@ -244,7 +244,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
     # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long, because one of Zenoh's few
-    # receiving threads waits for it meanwhile. All other messages are dropped when a link is congested.
+    # receiving threads is blocked until then. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP

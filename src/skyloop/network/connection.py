@@ -1,4 +1,4 @@
-"""Applications' connections at the transport server, publishing to them, and a thread that sends to individual ones.
+"""The connections of applications at a transport server, and a thread that sends to individual ones.
 
 Threads that answer an application only queue the answer here, and the sending thread never waits for an application. An
 application that acknowledges nothing uses a bounded amount of memory.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import zenoh
 
 #: Maximum number of one application's packets, and of its commands, that wait for the handler. Further packets are not
-#: acknowledged and are therefore resent; further commands are dropped, since newer ones follow. Set-points count once.
+#: acknowledged and are therefore resent; further commands are dropped: newer ones follow. Set-points count as one.
 MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
 _OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are requested again
@@ -61,7 +61,7 @@ class ServerConnection:
         self.left = False  #: the application has unsubscribed from everything for good
 
     def may_command(self, drone: str) -> bool:
-        """Return whether its proven identity permits more than queries to this drone."""
+        """Return whether the application's proven identity permits more than queries to this drone."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 
@@ -70,9 +70,9 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet of a topic, or (if empty) of those to this application only, it has acknowledged.
+        """Record up to which packet the application has acknowledged a topic, or (if empty) packets to it alone.
 
-        Returns whether further packets sent to this application only may be due.
+        Returns whether further packets that go only to this application may be due.
         """
         with self.lock:
             if not topic:
@@ -123,13 +123,13 @@ Put = Callable[[ServerConnection, bytes, int], object]
 
 
 class Sender:
-    """Sends the connections' packets by ``put`` in its thread, and resends unacknowledged ones."""
+    """Sends the connections' packets with ``put`` on a separate thread, and resends unacknowledged ones."""
 
     def __init__(self, put: Put, name: str) -> None:
         self._put = put
         self._changed = threading.Condition(threading.Lock())
         self._ready: dict[ServerConnection, None] = {}  # in order of arrival
-        self._waiting: set[ServerConnection] = set()  # with unacknowledged packets; used only by this thread
+        self._waiting: set[ServerConnection] = set()  # those with unacknowledged packets; used only by this thread
         self._ended = False
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
 
@@ -201,7 +201,7 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing.
 
-        Publishers are not undeclared, which would fail while another thread uses one; each ends with its last user.
+        Publishers aren't undeclared, because that fails while another thread uses one; each ends with its last user.
         """
         with self._lock:
             self._session = None
@@ -241,7 +241,7 @@ class Publisher:
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))
@@ -293,7 +293,7 @@ class Publisher:
             self._subscribed.pop(topic, None)
             if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # it ends with its last user
+                self._publishers.pop(topic, None)  # freed once its last user drops it
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         newest_wins = layout.newest_wins(topic)

@@ -37,7 +37,7 @@ class _Packet:
     number: int
     data: bytes
     way: str
-    sent_s: float = 0.0  #: when it was last sent; 0: not yet
+    sent_s: float = 0.0  #: when the packet was last sent; 0: not yet
 
 
 class Outgoing:
@@ -166,9 +166,9 @@ class Pace:
 
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
-        self._eager = False  # it acknowledges more often than required, so its silence is significant
+        self._eager = False  # the other end acknowledges more often than required, so its silence is significant
         self._sent_s = -math.inf  # when the newest packet was sent
-        self._since_s = math.inf  # when the oldest unacknowledged packet was sent, or later
+        self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
     def may_send(self, now_s: float) -> bool:
         """Return whether another packet may be sent now."""
@@ -207,7 +207,7 @@ class Receiver:
     """Receives packets at one end of a connection: numbered ones exactly once and in order, all others at most once.
 
     The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
-    other packets are passed to ``deliver``. Thread-safe: for numbered packets, only one thread at a time calls either.
+    other packets are passed to ``deliver``. Thread-safe; numbered packets are passed on by one thread at a time.
     """
 
     def __init__(self) -> None:

@@ -37,12 +37,12 @@ ANSWER_S: Final = 0.5  #: time for proxies to send their descriptions
 SYNC_S: Final = 5.0
 RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three if the network was split
 SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
-YOUNG_S: Final = 1.0  #: up to this age, a session searches well without help
-FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not tried again for this long
+YOUNG_S: Final = 1.0  #: age up to which a session needs no help with searching
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long
 _POLL_S: Final = 0.05
 JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
-MAX_CANDIDATES: Final = 4  #: with keys: number of proxies with one name that are asked until one proves its identity
+MAX_CANDIDATES: Final = 4  #: with keys: how many proxies with the same name to ask until one proves its identity
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
@@ -191,8 +191,8 @@ def _search(session: Session) -> set[str]:
 class ProxyWatch:
     """Monitors which transport servers with one name are alive.
 
-    ``on_gone``: called with the run of one that disappears, on one of Zenoh's threads. ``known``: the description of a
-    proxy with this name, if received earlier; it is not requested again.
+    ``on_gone``: called on one of Zenoh's threads with the run of a proxy that disappears. ``known``: the description of
+    a proxy with this name, if received earlier; it is not requested again.
     """
 
     def __init__(

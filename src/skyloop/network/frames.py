@@ -1,7 +1,7 @@
 """Send the server's video. Each subscribed variant of a frame is encoded once and sent no faster than readers take it.
 
-Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until it acknowledges one; then it
-gets the newest. A slow link thus shows fewer frames, but never old ones.
+Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until the reader acknowledges one;
+then it gets the newest. A slow link thus shows fewer frames, but never old ones.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: number of frames in flight to one reader
-#: Forms of one camera's frames. Each is encoded separately; the n parts of one form together cost no more than one. The
-#: default forms are not counted, which leaves room for a pilot whatever others request.
+#: Formats of one camera's frames. Each is encoded separately; a format split into n parts costs no more than a whole
+#: one. The default formats are not counted, which leaves room for a pilot whatever others request.
 MAX_FORMS: Final = 32
-MAX_FORMS_EACH: Final = 8  #: number of forms that one connection may read
+MAX_FORMS_EACH: Final = 8  #: number of formats that one connection may read
 #: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class Reader:
     def __init__(self) -> None:
         self._on_way: deque[tuple[int, int]] = deque()  # number and time sent
         self.due = False  #: the newest frame should be sent to it
-        self.waits = False  #: it has missed a frame
+        self.waits = False  #: the connection has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
         """Return whether another frame may be sent. Frames sent longer than :data:`LOST_NS` ago are considered lost."""
@@ -79,7 +79,7 @@ class Reader:
 
 
 class Variant:
-    """One form of a camera's frames, and its readers."""
+    """One format of a camera's frames, and its readers."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
@@ -92,7 +92,7 @@ class FramePublisher:
     """Publishes the frames of all of a server's cameras. Thread-safe; copies, encodes and sends outside its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
-        #: Returns why a topic can't be subscribed to; empty if it can.
+        #: Returns why a topic can't be subscribed to, or an empty string if it can be.
         self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send
         self._name = name
@@ -105,7 +105,7 @@ class FramePublisher:
         self._unable: set[str] = set()  # topics whose encoding failed and has been logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that miss it, having :data:`WINDOW` frames in flight.
+        """Publish a frame; return the number of readers that miss it because they have :data:`WINDOW` frames in flight.
 
         If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
         """
@@ -136,7 +136,7 @@ class FramePublisher:
         return missed
 
     def readers(self, camera: str) -> int:
-        """Return the number of subscriptions to a camera, in all forms."""
+        """Return the number of subscriptions to a camera, in all formats."""
         with self._changed:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
@@ -161,7 +161,7 @@ class FramePublisher:
         return True
 
     def problem(self, key: Hashable, topic: str) -> str:
-        """Return why a connection can't have these frames; empty if it can."""
+        """Return why a connection can't have these frames, or an empty string if it can."""
         with self._changed:
             return self._problem(key, topic)
 
@@ -180,10 +180,10 @@ class FramePublisher:
             return ""
         mine = [known for known, variant in variants.items() if key in variant.readers and variant.request not in usual]
         if len(mine) >= MAX_FORMS_EACH:
-            return f"a connection reads at most {MAX_FORMS_EACH} forms of a camera beside the default: {_listed(mine)}"
+            return f"a connection gets at most {MAX_FORMS_EACH} formats per camera besides the default: {_listed(mine)}"
         others = {known: variant.request for known, variant in variants.items() if variant.request not in usual}
         if topic not in variants and sum(map(_cost, others.values())) + _cost(request) > MAX_FORMS:
-            return f"a camera's frames are encoded in at most {MAX_FORMS} forms: choose one of {_listed(others)}"
+            return f"a camera's frames are encoded in at most {MAX_FORMS} formats: choose one of {_listed(others)}"
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:
@@ -244,7 +244,7 @@ class FramePublisher:
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
-        """Wait for a variant with readers due for its newest frame; return all three (readers None: all).
+        """Wait until a variant's newest frame is due for readers; return variant, frame and readers (None: all).
 
         None at the end, or if the camera has no readers.
         """
@@ -278,7 +278,7 @@ class FramePublisher:
 
 
 def _cost(request: VideoRequest) -> float:
-    """Return the fraction of frames that must be encoded for a form."""
+    """Return the fraction of frames that must be encoded for a format."""
     return 1.0 if request.part is None else 1.0 / request.part[1]
 
 

@@ -39,17 +39,17 @@ PLAIN: Final = "-"  #: the variant with a camera's unchanged frames
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
 
-# Keys that an application sends by, weakest right first.
+# Kinds of keys for an application's packets, the kind with the weakest right first.
 ASK: Final = "ask"  #: reliable; also for observers
 ORDER: Final = "order"  #: reliable; only for pilots
 COMMAND: Final = "command"  #: best effort; the command channel
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: Requests that observers may send. Any other needs the right to order, so new kinds of requests are safe by default.
+#: Requests that observers may send. Any other needs the right to order, so that new kinds are safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole head, because garbage must keep its order
-_POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may rely on it to fly
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, because garbage must stay in order
+_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need these to fly
 
 
 class Sender(NamedTuple):
@@ -101,11 +101,11 @@ def topic(name: str, topic_name: str) -> str:
 
 def newest_wins(topic_name: str) -> bool:
     """Return whether only a topic's newest packet counts, so that it may be lost and never waits for earlier ones."""
-    return topic_name.partition("?")[0] == FEEDBACK  # in any form
+    return topic_name.partition("?")[0] == FEEDBACK  # feedback in any variant
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key for frames of a variant, which is the part after the ``?`` in their topic."""
+    """Return the key for a variant's frames; the variant is the part after the ``?`` in their topic."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
@@ -171,7 +171,7 @@ def way_of(packet: bytes) -> str:
 
 
 def is_report(packet: bytes) -> bool:
-    """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong if it arrives late."""
+    """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong once it is late."""
     return packet[:6] == _REPORT
 
 

@@ -57,7 +57,7 @@ class Seen(NamedTuple):
 
 
 class Bye(NamedTuple):
-    """Why the connection ends."""
+    """The reason for which the connection ends."""
 
     reason: str
 

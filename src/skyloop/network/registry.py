@@ -79,9 +79,9 @@ class ConnectionRegistry:
         self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
         self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
         self.turned_away = 0  #: number of connections and tokens refused because of the limits
-        self._away = ""  # why, until the handler has been notified
+        self._away = ""  # why they were turned away, until the handler has been notified
         self.strays = 0  #: number of samples and queries without a connection
-        self._stray_commands = 0  # commands and requests among them, not reported to the handler yet
+        self._stray_commands = 0  # number of commands and requests among them, not yet reported to the handler
 
     def open(self) -> None:
         """Start admitting applications."""
@@ -246,7 +246,7 @@ class ConnectionRegistry:
     def _check_keys(self) -> None:
         """End connections whose keys have been excluded or have expired.
 
-        If there were any, create a new key for published packets, so that they can't read these any more.
+        If there were any, create a new key for published packets, so that they can no longer read them.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:
@@ -278,7 +278,7 @@ class ConnectionRegistry:
     # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that must arrive. Return False if the connection has ended or this ends it. Any thread."""
+        """Send a packet that must arrive. Return False if the connection has ended or ends here. Any thread."""
         if connection.ended:
             return False
         if problem := connection.queue(packet):

@@ -29,12 +29,12 @@ KEY_BYTES: Final = 32
 #: How many packets late a packet may arrive: datagrams can overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
 GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
-#: How long after sending a new topic key it is first used, so that it arrives before the first packet sealed with it.
+#: Delay between sending a new topic key and first using it, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """Seal and opener for use without keys: changes nothing."""
+    """Seal and opener for use without keys; they change nothing."""
 
     tag = trailer = 0
 
@@ -153,8 +153,8 @@ class TopicSeal:
     def renew(self) -> None:
         """Create a new key, :attr:`newest`, for all remaining applications; it takes effect after :data:`SWITCH_S`.
 
-        A pending switch is not delayed by another one, because the first excluded application could go on reading. The
-        remaining ones may therefore miss packets until the newer key arrives.
+        A pending switch is not delayed by another one, because otherwise the first excluded application could go on
+        reading. The remaining ones may therefore miss packets until the newer key arrives.
         """
         if self._in_use is self.newest:
             self._since = self._clock() + SWITCH_S

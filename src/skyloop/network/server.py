@@ -1,7 +1,7 @@
 """The proxy's end of the fabric transport.
 
 Zenoh's threads only sort incoming packets. A separate thread calls the handler, commands first, so that a slow handler
-does not delay signs of life. Another one sends to individual applications, so that an application that acknowledges
+does not delay signs of life. A third thread sends to individual applications, so that an application that acknowledges
 nothing does not delay the handler. Sending never blocks on an application.
 """
 
@@ -29,7 +29,7 @@ from skyloop.transport.priority import SUPERSEDED, is_command
 if TYPE_CHECKING:
     import zenoh
 
-FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
+FAREWELL_S: Final = 0.5  #: time that applications get to receive the reason when a transport server stops
 _POLL_S: Final = 0.5  # interval between checks of the connections
 _REFUSED: Final = b""  # represents a refused packet
 _COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
@@ -149,7 +149,7 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its forms."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -249,7 +249,7 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # otherwise it takes the previous one's turn
+        if not superseded:  # otherwise the packet takes the turn of the one it replaces
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:

@@ -60,7 +60,7 @@ class Session:
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
 
     def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
-        """Declare a publisher; packets are dropped if the path is congested and, by ``best_effort``, never resent."""
+        """Declare a publisher; packets are dropped if the path is congested and, with ``best_effort``, never resent."""
         z = load()
         reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
@@ -76,12 +76,12 @@ class Session:
             return set()
 
     def shut_out(self) -> frozenset[str]:
-        """Return the linked nodes that the newest roster excludes; Zenoh still applies the one from its start."""
+        """Return the linked nodes that the newest roster excludes; Zenoh still applies the roster from its start."""
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
     def over(self, now: float) -> bool:
-        """Return whether it has been unused for long enough. For use by the pool."""
+        """Return whether the session has been unused for long enough to close it. For use by the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
@@ -153,7 +153,7 @@ class _Pool:
             self._close(session)
 
     def retire(self, session: Session) -> None:
-        """Give new users another session from now on; this one closes after its last user."""
+        """Give new users another session from now on; this one closes once its last user has left."""
         with self._changed:
             session.retired = True
 
@@ -161,8 +161,8 @@ class _Pool:
         """Close all sessions when the process ends.
 
         Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh: on
-        returning to Python it would be ended by an exception that can't pass through native code, which aborts the
-        process ("FATAL: exception not rethrown").
+        returning to Python, such a thread would be ended by an exception that can't pass through native code, which
+        aborts the process ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -231,7 +231,7 @@ def host_name() -> str:
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session that has no other users by one at the same addresses with the newest roster.
+    """Replace a session that has no other users with one at the same addresses that uses the newest roster.
 
     All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
     not become free again within :data:`REOPEN_S`.
@@ -255,7 +255,7 @@ def undeclare(held: Iterable[Any]) -> None:
         for _ in range(_BORROWED):
             try:
                 each.undeclare()
-            except ended:  # the session has ended, and its declarations with it
+            except ended:  # the session has ended, and so have its declarations
                 break
             except RuntimeError:  # "Already borrowed": another thread is sending with it
                 time.sleep(_BORROWED_S)

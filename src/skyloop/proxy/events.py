@@ -1,7 +1,7 @@
 """What a proxy reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, followed by its input: event drafts, which pure functions create, first about commands,
-failsafe and ownership, then about the authority.
+The publisher comes first, followed by the pure functions that create its input, the event drafts: those about commands,
+failsafe and ownership, then those about the authority.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from skyloop.zones import THINNEST_M, ZONES, Space
 
 #: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
-MAX_TEXT: Final = 1000  #: characters in an event's text
-REPEAT_NS: Final = NS_PER_S  #: how often an event that continues is published again
+MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
+REPEAT_NS: Final = NS_PER_S  #: interval at which a continuing event is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
 #: Why a hover or landing is abandoned.
@@ -69,7 +69,7 @@ class EventPublisher:
         self._publish = publish
         self._clock = clock
         self._counts = counters.counts
-        self._lock = threading.Lock()  # keeps events in order of their numbers
+        self._lock = threading.Lock()  # keeps events in the order of their numbers
         self._seq = 0
         self._repeats = RepeatedEvents()
         self._missed = 0
@@ -111,10 +111,10 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # if this event itself gets lost, no further one reports that
+                self._missed = 0  # if this event is lost, no other event reports that
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
-        """Number events and publish them. The lock is held."""
+        """Number events and publish them. The caller holds the lock."""
         scrub, packets = self._scrub, []
         told = [
             (one, scrub(one.text), {key: scrub(it) if isinstance(it, str) else it for key, it in one.data.items()})
@@ -239,7 +239,7 @@ def thin_zones_event(space: Space) -> EventDraft:
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event for a position that changed by more than flying can explain; ``lands``: it was landing."""
+    """Return the event for a jump of the position; ``lands``: whether the vehicle was landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
@@ -300,7 +300,7 @@ def ownership_event(changed: Changed) -> EventDraft:
 
 
 def slept_event(slept_s: float) -> EventDraft:
-    """Return the event for a sleep of this computer [s]."""
+    """Return the event that reports how long this computer slept [s]."""
     text = f"this computer slept for {slept_s:.1f} s: earlier commands are no longer executed"
     data: dict[str, Value] = {"reason": "slept", "seconds": slept_s}
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data=data)

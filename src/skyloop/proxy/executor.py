@@ -1,4 +1,4 @@
-"""Execute actions, by the driver if the vehicle supports them, otherwise by the software autopilot; fly returns.
+"""Execute actions with the driver or, if the vehicle doesn't support them, the software autopilot; fly the return.
 
 Not thread-safe: the command handler's lock is held during every call. Parameters and external poses bypass this module.
 """
@@ -52,7 +52,7 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether the path to a target must be checked, so that the software autopilot flies there.
+        #: Whether the path to a target must be checked, in which case the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
@@ -67,7 +67,7 @@ class ActionExecutor:
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may fly; if it never reports its state, that is from the first command on."""
+        """Whether the vehicle flies or may fly; without a reported state, it may from the first command on."""
         return self.flight.flies(self.state)
 
     @property
@@ -141,7 +141,7 @@ class ActionExecutor:
         return True
 
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
-        """Hover or land without a pilot; return whether it was accepted. Failures are published, not raised."""
+        """Hover or land without a pilot; return whether it was accepted. Failures are published rather than raised."""
         if type(action) in self.native:
             taken = False
             try:
@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently: no further commands are sent.
 
-        If the vehicle has no hover of its own, it is brought to a standstill as well as a single set-point can do it.
+        A vehicle without a native hover is also stopped, as far as a single set-point can do that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -172,7 +172,7 @@ class ActionExecutor:
         last: Velocity | Attitude = Velocity() if Velocity in self.native else Attitude()
         try:
             self._driver.apply(last)
-        except Exception as error:  # noqa: BLE001  it is reported; nothing else helps
+        except Exception as error:  # noqa: BLE001 it is reported, and nothing more can be done
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
@@ -207,8 +207,8 @@ class ReturnSupervisor:
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._problem = ""  # why the ladder's return can't continue
-        self._good_ns = 0  # when it could last continue
+        self._problem = ""  # why the ladder's return flight can't continue
+        self._good_ns = 0  # when the return was last able to continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
         """Start the ladder's return; :meth:`update` continues it."""
@@ -218,7 +218,7 @@ class ReturnSupervisor:
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
         """Observe the start, and fly back if the ladder requires it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's own; a vehicle flown by others is not returning for us.
+        ``ours``: whether the flight is the proxy's own; a vehicle flown by others does not return on our behalf.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
@@ -236,7 +236,7 @@ class ReturnSupervisor:
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't fly back to the start; empty if it can, or need not."""
+        """Return why the ladder can't fly back to the start; empty if it can, or does not need to."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem

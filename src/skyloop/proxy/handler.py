@@ -1,4 +1,4 @@
-"""The command handler: executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler, which executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
-#: Echo of a command without a new effect, because it was refused or held.
+#: Echo of a command that had no new effect because it was refused or held.
 _NOTHING: Final = Idle()
 
 
@@ -88,13 +88,13 @@ class CommandHandler(FlightSupervisor):
                 self._executor.autopilot.settings = settings.autopilot
 
     def problem_with_ceiling(self, altitude: float) -> str:
-        """Return why ``limits.altitude`` must not be lowered to this height [m] now, as text; empty if it may."""
+        """Return a readable reason not to lower ``limits.altitude`` to this height [m] now; empty if there is none."""
         with self._lock:
             flies = self._executor.airborne
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return why a momentary parameter, such as a flip, must not be written now, as text; empty if it may."""
+        """Return a readable reason not to write a momentary parameter, such as a flip, now; empty if there is none."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
@@ -114,12 +114,12 @@ class CommandHandler(FlightSupervisor):
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # keep withdrawing it, because nothing does so later
+                self._rising_until_ns = now_ns  # keep withdrawing the take-off, because nothing else does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering, as well as it can without the proxy, which is ending."""
+        """Leave a flying vehicle hovering as well as it can without the proxy, which is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -203,7 +203,7 @@ class CommandHandler(FlightSupervisor):
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
         """Check a command and execute it, on the receiving thread."""
-        # Give it its true age: after a sleep of the computer, an old command looks as if just sent.
+        # After the computer has slept, an old command looks as if it had just been sent: restore its true age.
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -216,15 +216,15 @@ class CommandHandler(FlightSupervisor):
                 applied, applied_ns = self._obey(session, command, now_ns)
         self._counts["commands.received"] += 1
         if self._subscribers(COMMANDS):
-            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # limits of that field in the echo
+            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # within the limits of that field in the echo
             action, app_id = command.action, session.app_id
             echo = Applied(command.seq, command.lease, app_id, sent_ns, applied_ns, action, applied)
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Return what was applied and when; for a refused command, when it was received."""
-        # On a machine that was idle, as it usually was before a command, each function call costs microseconds. So
-        # ordinary commands are received, decided and executed here, while error messages are written elsewhere.
+        # On a machine that was idle, which is usual before a command, each function call costs microseconds. Ordinary
+        # commands are therefore received, judged and executed here; error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
@@ -256,7 +256,7 @@ class CommandHandler(FlightSupervisor):
             return _NOTHING, self._count_applied(command)
         if intent.over:
             self._report_intent(session)
-            if intent.reason is None:  # it was carried out
+            if intent.reason is None:  # the intent was executed
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
@@ -265,7 +265,7 @@ class CommandHandler(FlightSupervisor):
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may come with a substitute, a hover. If the vehicle rejects that, the old one must still end.
+            # A refusal may come with a substitute, a hover. If the vehicle rejects it, the old action must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -294,7 +294,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # This precedes the intent in feedback, where an "arrived" would still be that of the previous return.
+        # Observe the return before reporting the intent, because "arrived" would still refer to the previous return.
         if fresh and self._returns.observe():
             self._stamp()
         self._report_intent(session)
@@ -305,7 +305,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after a new command by an application, or if no others are flying the vehicle."""
+        """Make the flight ours after a new command from an application, or if no one else is flying the vehicle."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -335,11 +335,11 @@ class CommandHandler(FlightSupervisor):
             return self._refuse(session, command, Refusal.UNSUPPORTED, why), now_ns
         try:
             applied = self._executor.execute(command.action, now_ns)
-        except Exception as error:  # noqa: BLE001  it is reported, and the repeats retry
+        except Exception as error:  # noqa: BLE001 it is reported, and the repeats try again
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # a stop's repeats count as a sign of life: nothing else is sent
+            self.authority.last_command_ns = now_ns  # repeats of a stop count as signs of life: nothing else is sent
         self._rising_until_ns = None  # only the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None

@@ -44,10 +44,10 @@ from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.requests import Session
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
-MAX_TEXT: Final = 1024  #: characters in a text value
-MAX_PARAMETER: Final = 8192  #: bytes in an encoded parameter; larger ones from a driver are left out
+MAX_TEXT: Final = 1024  #: maximum number of characters in a text value
+MAX_PARAMETER: Final = 8192  #: maximum number of bytes in an encoded parameter; larger ones from a driver are left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
+#: A momentary parameter, such as a flip, is written within this time or not at all: its writer won't wait longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -55,7 +55,7 @@ _encoded = msgspec.msgpack.Encoder().encode
 
 
 def described(driver: Driver) -> list[Parameter]:
-    """Return a driver's parameters, plus one that holds its findings. Raises the driver's errors."""
+    """Return a driver's parameters, plus one with the findings of its check. Raises the driver's errors."""
     parameters = list(driver.parameters())
     try:
         diagnostics = driver.checkup()
@@ -137,8 +137,8 @@ OWN: Final[tuple[Parameter, ...]] = (
 def check(parameter: Parameter, value: Value) -> Value:
     """Return the value to write, checked for type, finiteness, range and choices.
 
-    An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError` that names the
-    allowed values, with the :class:`Refusal` as its code.
+    An int counts as a float, but a bool does not count as a number. Raises :class:`ParameterError`, which names the
+    allowed values and has the :class:`Refusal` as its code.
     """
     if parameter.read_only:
         raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
@@ -170,7 +170,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number to write, alone or in a vector: finite and within the range."""
+    """Return a number to write, alone or in a vector, checked to be finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -265,7 +265,7 @@ class Parameters:
         self._presets: dict[str, Value] = {}  # presets not yet written to the driver
         self.left_out: tuple[str, ...] = ()  #: names of the driver's parameters that are too large to send
         self._in_force: dict[str, Any] = {}  # values of the proxy's own parameters
-        self._changed: set[str] = set()  # first parts of the names of parameters that the settings don't reflect yet
+        self._changed: set[str] = set()  # prefixes of the names of parameters that the settings don't reflect yet
         self._settings = FlightSettings()
         self._apply(OWN)
 
@@ -312,7 +312,7 @@ class Parameters:
         return value
 
     def _apply(self, parameters: Iterable[Parameter]) -> None:
-        """Apply values of the proxy's own parameters, and record which have changed. The lock is held."""
+        """Apply values of the proxy's own parameters, and record which have changed. The caller holds the lock."""
         for standard in parameters:
             name, kind = standard.name, standard.type
             own = self._own[name].value
@@ -368,8 +368,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. As they also change without being written, each
-    is always read again, and changes cause no event.
+    ``free``: parameters that any pilot may write without the authority. Because these also change without being
+    written, each is read again every time, and changes cause no event.
     """
 
     def __init__(

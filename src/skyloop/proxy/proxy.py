@@ -1,8 +1,8 @@
-"""The proxy: makes one vehicle's driver a node that any number of applications observe and one at a time flies.
+"""The proxy, a node through which any number of applications observe a vehicle and one at a time flies it.
 
 Threads: those of the transport execute commands and pass on poses, those of the driver publish, a ticker (50 Hz)
-    updates authority, failsafe and autopilot, and one more answers requests. The handler's lock is held whenever the
-    driver is called to fly, including in ``end``.
+    updates authority, failsafe and autopilot, and one more answers requests. The handler's lock is held during every
+    driver call that flies the vehicle, including those in :meth:`end`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ from skyloop.proxy.requests import HELLO_NS, MAX_MALFORMED, JobQueue, RequestDis
 from skyloop.proxy.topics import OverviewPublisher
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_NAME: Final = 64  #: characters in a proxy's name
+MAX_NAME: Final = 64  #: maximum number of characters in a proxy's name
 
 _POLL_S: Final = 0.2
 _ABANDON_S: Final = 1.0  #: how long ending a proxy waits for its other parts if the driver hangs
@@ -77,10 +77,10 @@ _log = logging.getLogger(__name__)
 class Proxy:
     """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
 
-    Applications connect by ``name``, of 1 to 64 characters; ``clock`` is that of all samples [ns]. ``ticker=False``:
-    the caller calls :meth:`tick`, as for many proxies in a process, tests, or simulated time. ``jobs``: answers
-    requests that may wait for the vehicle; by default on a separate thread. ``slept``: returns how long the computer
-    has slept in total [ns]; by default the system's, if the clock is.
+    Applications connect by ``name``, which has 1 to 64 characters. ``clock`` gives the time of all samples [ns]. With
+    ``ticker=False``, the caller calls :meth:`tick`, for example for many proxies in a process, or in simulated time.
+    ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept`` returns how long
+    the computer has slept in total [ns]; the default is the system's if ``clock`` is.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Proxy:
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = False
-        self.ended = False  #: whether it is ending, or has ended
+        self.ended = False  #: whether the proxy is ending, or has ended
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
@@ -231,20 +231,20 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight, then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
+        """End the flight, then the proxy, and release all resources. Idempotent. Not for the driver's own threads.
 
-        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle flies.
-        Then a flying vehicle is landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it is left
-        hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
+        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
+        flying. A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in
+        time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
-        without the proxy is still landed, however long it takes, because otherwise it would fall. ``unless_flying``: if
-        the vehicle does not land in time, the landing continues, and so does the proxy. ``hangs``: the driver hangs or
-        fails, so nothing waits for it, and it is not asked to land or hover: calls that may hang are left to daemon
-        threads, as if the proxy had been killed.
+        without the proxy is still landed, however long it takes, because otherwise it would fall. With
+        ``unless_flying``, the landing and the proxy continue if the vehicle does not land in time. With ``hangs``, the
+        driver hangs or fails: nothing waits for it, it is not asked to land or hover, and calls that may hang are left
+        to daemon threads, as if the proxy had been killed.
 
-        Returns whether no flight of the proxy remains. Raises the error of a step, once all steps are done; if the
-        driver hangs, errors are logged instead.
+        Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done; if
+        the driver hangs, errors are logged instead.
         """
         if not self._started or self.ended:
             return True
@@ -261,7 +261,7 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # these run from last to first, even if others raise
+        with ExitStack() as steps:  # the steps run from last to first, even if others raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
@@ -286,7 +286,7 @@ class Proxy:
         return not handler.airborne
 
     def _close(self) -> None:
-        with ExitStack() as steps:  # these run from last to first
+        with ExitStack() as steps:  # the steps run from last to first
             steps.callback(self.server.stop)
             steps.callback(self.publisher.streams.end)
             steps.callback(self.driver.close)
@@ -297,7 +297,7 @@ class Proxy:
         self.ended = True
 
     def _abandon(self) -> None:
-        """Release resources without waiting for hanging parts; failures go to the log."""
+        """Release resources without waiting for parts that hang, and log failures."""
         parts: tuple[Callable[[], object], ...] = (self.server.stop, self.driver.close, self._requests.stop)
         threads = [
             threading.Thread(target=self._give_back, args=(part,), name="skyloop-abandoned", daemon=True)
@@ -374,7 +374,7 @@ class Proxy:
         )
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to; empty if it can."""
+        """Return why a topic can't be subscribed to, or an empty string if it can be."""
         return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -422,7 +422,7 @@ class Proxy:
     # Time ------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Update everything that depends on time: authority, failsafe, autopilot, feedback while silent, events."""
+        """Update all that depends on time: authority, failsafe, autopilot, events, and a silent vehicle's feedback."""
         if self._stopping.is_set():  # a shared ticker, or one that was hanging, may tick after the end
             return
         self.tick_flight(now_ns)
@@ -440,7 +440,7 @@ class Proxy:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the vehicle is not flying, there is no pilot, and feedback shows both, so that nothing is urgent."""
+        """Whether feedback already shows that the vehicle is not flying and has no pilot, so that nothing is urgent."""
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
@@ -462,7 +462,7 @@ class Proxy:
         while not self._stopping.wait(max(0, due_ns - time.monotonic_ns()) / 1e9):
             try:
                 self.tick(self.clock())
-            except Exception:  # noqa: BLE001  the vehicle needs its failsafe whatever is wrong here
+            except Exception:  # noqa: BLE001 the vehicle needs its failsafe whatever goes wrong here
                 _log.exception("a step of the ticker failed")
             due_ns = max(due_ns + period_ns, time.monotonic_ns())  # missed periods are skipped
 

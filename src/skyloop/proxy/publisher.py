@@ -58,9 +58,9 @@ class VehiclePublisher:
     It acquires no lock that is held while the driver is called, so a driver may call it on any thread, even
     re-entrantly.
 
-    ``state_of``: returns the flight state, given the driver's, because the software autopilot may know better.
-    ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the secrets in
-    the vehicle's address from a text.
+    ``state_of`` returns the flight state, given the driver's, because the software autopilot may know better.
+    ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
+    in the vehicle's address from a text.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # the same as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -141,7 +141,7 @@ class VehiclePublisher:
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Set the outcome of an intent in feedback; if it has ended, that is published by the next tick."""
+        """Set the outcome of an intent in feedback; if the intent has ended, the next tick publishes the outcome."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
@@ -161,7 +161,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def wait_for(self, wanted: Callable[[FlightState], bool], timeout_s: float) -> bool:
-        """Block until the flight state meets a condition; return False after the time-out. Not on drivers' threads."""
+        """Block until the flight state meets a condition; return False after the time-out. Not for drivers' threads."""
         with self._publishing:
             return self._publishing.wait_for(lambda: wanted(self._state), timeout_s)
 
@@ -278,7 +278,7 @@ class VehiclePublisher:
         return {*self._cameras, *self._frame_seq.copy()}
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to; empty if it can. Thread-safe."""
+        """Return why a topic can't be subscribed to, or an empty string if it can be. Thread-safe."""
         if topic.startswith(PREFIX):
             return self.variants.problem(topic)
         problem = topic_problem(topic, self.cameras)
@@ -312,7 +312,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as encoded by the vehicle."""
+        """Publish a frame as encoded by the vehicle."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -330,7 +330,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded pictures have receivers."""
+        """Return whether this camera's encoded frames have receivers."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
@@ -349,7 +349,7 @@ class VehiclePublisher:
             before, self.link_state = self.link_state, state
             self.link_reason, self.link_remedy = reason, remedy
             was_up, self.link_up = self.link_up, state in _LINK_UP
-            if was_up != self.link_up and (was_up or self.link_breaks):  # except when it comes up for the first time
+            if was_up != self.link_up and (was_up or self.link_breaks):  # not counting the first time that it comes up
                 self.link_breaks += 1
             self._published_ns = -KEEP_ALIVE_NS  # published in feedback at the next tick
         if same:
@@ -361,7 +361,7 @@ class VehiclePublisher:
         self._events.publish(EventKind.VEHICLE_LINK, text, severity, data=data)
         if before is state:
             return
-        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known now, so read it again
+        if self.link_up and (not was_up or state is LinkState.UP):  # everything may be known by now, so read it again
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:

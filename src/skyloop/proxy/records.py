@@ -1,11 +1,11 @@
-"""Write a proxy's files, each in its own thread: the audit trail, and the note about its flight.
+"""Write a proxy's files, each on a separate thread: the audit trail, and the note about its flight.
 
 The audit trail records who flew when, as one JSON object per line, append-only. ``docs/sharing.md`` describes it.
 :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
-The note records that a flight is this proxy's, so that after being killed and restarted, a proxy ends its own flight.
-It is written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over,
-belongs to others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
+The note records that a flight is this proxy's, so that a proxy that was killed and restarted ends its own flight. It is
+written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over, belongs to
+others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line; ``what`` determines its fields."""
+    """One line of an audit trail, whose other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
@@ -63,7 +63,7 @@ class Tenure(msgspec.Struct, frozen=True):
     identity: str
     priority: int
     begin: datetime
-    end: datetime | None  #: None if it continues, or if the proxy was killed
+    end: datetime | None  #: None if the tenure continues, or if the proxy was killed
     how: str  #: why it ended; empty if, according to the file, it has not ended
     takeoffs: int = 0
 
@@ -150,7 +150,7 @@ def audit_path(name: str) -> Path:
 
 
 class AuditTrail:
-    """Writes the lines about one run of a proxy in its own thread, so that :meth:`note` never waits for the disk."""
+    """Writes the lines about one run of a proxy on a separate thread, so that :meth:`note` never waits for the disk."""
 
     def __init__(self, path: Path, proxy: str, run: str, wall: Callable[[], datetime] | None = None) -> None:
         """Open the file. Raises ``OSError``."""
@@ -207,9 +207,9 @@ def record_path(name: str) -> Path:
 
 
 class FlightRecord:
-    """The file of one proxy, written in its own thread from :meth:`start` to :meth:`close`.
+    """The file with one proxy's flight record, written on a separate thread from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: the vehicle's address, as notes about other vehicles are ignored; ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored; ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:
@@ -245,7 +245,7 @@ class FlightRecord:
             self._changed.set()
 
     def close(self) -> None:
-        """Write the final state. The note stays if the vehicle is left in the air, for the next run to end this."""
+        """Write the final state. The note stays if the vehicle is left in the air, so that the next run can end it."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._closing = True

@@ -67,7 +67,7 @@ class Relay:
         self._counts = counters.counts
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
-        """Relay an annotation to its subscribers; return why it is malformed, or an empty text."""
+        """Relay an annotation to its subscribers; return why it is malformed, or an empty string."""
         if unknown := camera_problem(annotation.camera, self._cameras):
             return f"an annotation of an unknown frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
@@ -75,7 +75,7 @@ class Relay:
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Relay a log entry to its subscribers; return why it is malformed, or an empty text."""
+        """Relay a log entry to its subscribers; return why it is malformed, or an empty string."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:
@@ -181,7 +181,7 @@ class ProcessorWorkers:
     def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
         """Relay a result to its subscribers, marked with the number of the sending application.
 
-        Returns why it is malformed, or an empty text. A refused result is counted, and published as an event.
+        Returns why it is malformed, or an empty string. A refused result is counted, and published as an event.
         """
         if session.role is None:
             return "a result arrived before Hello"
@@ -265,7 +265,7 @@ class WorkerRoster:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """Return the worker that this application is for that processor, if it is one."""
+        """Return the application's worker for that processor, or None if it isn't one."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
@@ -277,7 +277,7 @@ class WorkerRoster:
         return [self._workers.pop(key).asked for key in keys]
 
     def joined(self, app_id: int) -> int:
-        """Return the number of processors that it works for."""
+        """Return the number of processors that the application works for."""
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:

@@ -45,7 +45,7 @@ MAX_MALFORMED: Final = 50
 HELLO_NS: Final = 5 * NS_PER_S
 
 MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat requests for a few seconds at most
-MAX_MESSAGE: Final = 1000  #: characters in a refusal's message
+MAX_MESSAGE: Final = 1000  #: maximum number of characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
 #: Requests that change something. Others may be answered again, with the state at the time of the repeat.
@@ -89,7 +89,7 @@ class Answers:
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
         """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
 
-        Returns whether it has been or is being executed, and whether the limit has been reached.
+        Returns whether the request has been or is being executed, and whether the limit has been reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -119,7 +119,7 @@ class JobQueue(Protocol):
         """Queue a job, which must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """End after the current job; if that hangs for longer, it is left to its daemon thread."""
+        """Stop after the current job; if that takes longer than this, leave it to its daemon thread."""
 
 
 class JobThread:
@@ -152,7 +152,7 @@ Answer = Callable[[Session, Any, int], AnyReply]
 
 
 class RequestDispatcher:
-    """Answers requests on the receiving thread or the thread of jobs, from :meth:`start` to :meth:`stop`.
+    """Answers requests on the receiving thread or the jobs thread, from :meth:`start` to :meth:`stop`.
 
     ``immediate`` and ``deferred``: the functions for these threads, by type of the request's body. Errors raised by
     deferred ones become refusals: ``on_failure`` gets the request's name and an unexpected error, and returns the text
@@ -181,15 +181,15 @@ class RequestDispatcher:
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current job; if the driver hangs for longer, it is left to its daemon thread."""
+        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Run a job, which must not raise, on the thread of requests, after those already waiting."""
+        """Run a job, which must not raise, on the requests thread, after those already waiting."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer at once, or later on the thread of requests. Called on the receiving thread."""
+        """Answer at once, or later on the requests thread. Called on the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:

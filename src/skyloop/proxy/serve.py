@@ -26,7 +26,7 @@ from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing after its program has gone
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
 _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; waiting is printed only afterwards
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
@@ -80,7 +80,7 @@ class Shutdown:
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
-        """Request the end. Thread-safe, also for signal handlers."""
+        """Request that the process end. Thread-safe, also for signal handlers."""
         if hurry or self.requested.is_set():  # a second signal means to end at once
             self.hurry.set()
         self.reason = self.reason or reason
@@ -144,8 +144,8 @@ def run(
     Starts the proxies, and stops them at the end; writes lines for each, as :func:`serve` does. ``audit``: file for the
     audit trail; by default each proxy has one in the user's state directory, except private ones (with ``parent_fd``).
     ``records``: whether to keep an audit trail, and a note about the flight for the next run; by default, private
-    proxies keep none, because they are never restarted under their name. ``beside``: a context around the proxies'
-    life.
+    proxies keep none, because they are never restarted under their name. ``beside``: a context entered while the
+    proxies run.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -186,7 +186,7 @@ def run(
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail; :class:`UsageError` if a requested file can't be written, unlike the default."""
+    """Give a proxy its audit trail; :class:`UsageError` if it can't be written to ``path``, if given."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -227,8 +227,8 @@ def at_once(
 ) -> None:
     """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
-    ``tell``: called with the ones for which there is no thread, before they are run one after another. ``over``:
-    returns whether to stop waiting for one. ``daemon``: whether the program may end before they do.
+    ``tell``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
+    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may end before they do.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
@@ -240,7 +240,7 @@ def at_once(
     for one in left:
         try:
             tell(one)
-        except Exception:  # noqa: BLE001  it is still ended
+        except Exception:  # noqa: BLE001 the ends are called regardless
             _log.exception("could not report that several flights end one after another")
     for one in left:
         ends[one]()
@@ -251,7 +251,7 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. On the main thread."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. Main thread only."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)

@@ -1,8 +1,8 @@
-"""Encode H.264 as subscribers request it: each form once, in its own thread, for all of its subscribers.
+"""Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
-A form with a fixed rate is shared by all that request it. A form with a subscriber's name is for that subscriber alone;
-its rate and size are adapted to the path, judging by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a form forwards it unchanged while the path can carry it, and otherwise encodes.
+A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
+alone; its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
+vehicle itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from skyloop.transport.base import TransportServer
 from skyloop.transport.frame_encoding import resized_header
 
 MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
-KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requested key pictures
-IDLE_S: Final = 1.0  #: a form ends its thread after this time without subscribers
-GOOD_BITS: Final = 0.2  #: bits per pixel beyond which a picture hardly improves
+KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requests for key frames
+IDLE_S: Final = 1.0  #: a stream ends its thread after this time without subscribers
+GOOD_BITS: Final = 0.2  #: bits per pixel beyond which images hardly improve
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 _FPS: Final = 30.0  # assumed rate of cameras that do not announce one
-_BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the picture, because each change costs a key picture
-#: Fraction of the path's rate up to which forwarding the vehicle's own pictures may start, and may continue.
+_BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the image, because each change costs a key frame
+#: Fraction of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
 #: If they overload the path, they are retried after this time, which doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
-_OWN_KBIT_S: Final = 12_000  # highest rate tried for them [kbit/s]
+_OWN_KBIT_S: Final = 12_000  # highest rate tried for the vehicle's own stream [kbit/s]
 _MEASURE_NS: Final = nanoseconds(1.0)
-_OWN_SILENT_NS: Final = nanoseconds(1.0)  # without a picture for this long, the vehicle has stopped
+_OWN_SILENT_NS: Final = nanoseconds(1.0)  # if no frame arrives for this long, the vehicle has stopped sending
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One form of one camera's H.264; ``publish`` is called on its thread, ``fail`` with a readable reason."""
+    """One camera's H.264 in one format; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class StreamForm:
         self.topic = topic
         self.request = request
         self.asked_ns = 0
-        self.skipped = 0  #: number of pictures not encoded, because the path or the encoder was busy
+        self.skipped = 0  #: number of frames not encoded, because the path or the encoder was busy
         self._fps = camera.fps if camera.fps > 0.0 else _FPS
         if request.max_fps is not None:
             self._fps = min(self._fps, request.max_fps)
@@ -81,10 +81,10 @@ class StreamForm:
         own = bool(camera.stream) and request.scale == 1.0 and request.max_fps is None
         most_kbit_s = max(self._kbit_s, _OWN_KBIT_S) if own else self._kbit_s
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
-        #: Whether the vehicle's own pictures may be forwarded.
+        #: Whether the vehicle's own stream may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether they are being forwarded while they arrive
-        self._own_ns = 0  # when the newest of them arrived
+        self._passing = False  # whether that stream is being forwarded, as long as its frames keep arriving
+        self._own_ns = 0  # when its newest frame arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards everything below, and the rate
@@ -96,27 +96,27 @@ class StreamForm:
         self._ended = False
         self._encoder: H264Encoder | None = None
         self._needs_encoder = False  # whether a new encoder is needed
-        self._own_kbit_s = 0.0  # rate of the vehicle's own pictures; 0: unknown
+        self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0: unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # a time, so that a recreated form continues with higher numbers
+        self._seq = clock() // 1_000_000  # a time, so that a recreated stream continues with higher numbers
 
     @property
     def passing(self) -> bool:
-        """Whether the vehicle's own pictures are being forwarded; False if it has stopped sending them."""
+        """Whether the vehicle's own stream is being forwarded; False if the vehicle has stopped sending it."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
     @property
     def max_fps(self) -> float:
-        """Maximum rate of frames that it uses; infinity if it uses all."""
+        """Maximum rate at which the stream uses frames; infinity if it uses all."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
-        """Switch back to encoding, starting with a key picture. The lock is held."""
+        """Switch back to encoding, starting with a key frame. The caller holds the lock."""
         self._passing, self._wants_key, self._needs_encoder = False, True, True
 
     def asked(self) -> None:
-        """Handle a new subscription. A subscriber that returns after a lost link won't acknowledge earlier pictures."""
+        """Handle a new subscription. A subscriber that returns after a lost link won't acknowledge earlier frames."""
         with self._changed:
             self._wants_key = True
             if self._rate is not None:
@@ -150,15 +150,15 @@ class StreamForm:
             self._changed.notify()
 
     def report(self, report: StreamReport, now_ns: int) -> None:
-        """Handle a subscriber's report: its newest picture, and whether it needs a key picture."""
+        """Handle a subscriber's report: its newest frame, and whether it needs a key frame."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
-            # A number that this form never sent would distort the measurement of the path.
+            # A number that this stream never sent would distort the measurement of the path.
             if self._rate is not None and report.seq <= self._seq:
                 self._rate.acknowledged(report.seq, now_ns)
 
     def own(self, picture: EncodedFrame, subscribers: int) -> EncodedFrame | None:
-        """Handle a whole picture encoded by the vehicle; return it ready to publish, or None to drop it."""
+        """Handle a complete frame encoded by the vehicle; return it ready to publish, or None to drop it."""
         rate, now_ns = self._rate, self._clock()
         with self._changed:
             self._measure(len(picture.data), now_ns)
@@ -167,9 +167,9 @@ class StreamForm:
                 self._passing = False
                 return None
             fits = rate.may_send(now_ns)
-            # Each picture refers to the previous one; after skipping one, encode until the vehicle's next key picture.
+            # Each frame refers to the previous one; after skipping one, encode until the vehicle's next key frame.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
-                if not self._wants_key:  # it was too much for the path
+                if not self._wants_key:  # the stream overloaded the path
                     self._try_ns = now_ns + self._again_ns
                     self._again_ns = min(2 * self._again_ns, _TRY_AT_MOST_NS)
                 self._encode_again()
@@ -192,7 +192,7 @@ class StreamForm:
             self._own_bytes, self._own_since_ns = 0, now_ns
 
     def end(self) -> None:
-        """End the thread, and wait for its current picture."""
+        """End the thread, and wait for its current frame."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -204,7 +204,7 @@ class StreamForm:
         while (picture := self._next()) is not None:
             try:
                 self._encode(picture)
-            except Exception as error:  # noqa: BLE001  (one picture is lost; the next may work)
+            except Exception as error:  # noqa: BLE001  (one frame is lost; the next may work)
                 self._encoder = None
                 self._fail(f"{self.topic}: a picture of {self.request.camera} can't be encoded: {error}")
             del picture
@@ -212,7 +212,7 @@ class StreamForm:
     def _next(self) -> _Picture | None:
         with self._changed:
             if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
-                # The lock is held, so a later put() starts another thread.
+                # This thread holds the lock, so a later put() starts another thread.
                 self._thread = None
                 self._encoder = None
                 self._wants_key = True
@@ -242,7 +242,7 @@ class StreamForm:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
             if self._passing:
-                return  # the vehicle's own pictures have replaced it
+                return  # the vehicle's own stream has replaced it
             self._seq += 1
             seq = self._seq
             if is_key:
@@ -276,7 +276,7 @@ class StreamForm:
 
 
 class Streams(Forms[StreamForm]):
-    """All forms of a vehicle's cameras."""
+    """All encoded streams of a vehicle's cameras."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
         super().__init__(MAX_FORMS, server.subscribers, clock)
@@ -285,7 +285,7 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a form can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
+        """Return why a format can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
                 f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "
@@ -300,12 +300,12 @@ class Streams(Forms[StreamForm]):
                 form.asked()
             return ""
         return (
-            f"this proxy encodes video in at most {MAX_FORMS} forms at a time, and all are in use: subscribe to one of "
+            f"this proxy encodes video in at most {MAX_FORMS} formats, and all are in use: subscribe to one of "
             f"{', '.join(form.topic for form in self.known if not form.request.subscriber) or 'its frames as JPEG'}"
         )
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the highest frame rate among those of this camera's encoded forms that have subscribers."""
+        """Return the highest frame rate among this camera's encoded streams that have subscribers."""
         watched = (
             one.max_fps
             for one in self.known
@@ -314,13 +314,13 @@ class Streams(Forms[StreamForm]):
         return max(watched, default=0.0)
 
     def wants_own(self, camera: str) -> bool:
-        """Return whether a form may forward the vehicle's own pictures of this camera."""
+        """Return whether any format may forward the vehicle's own stream from this camera."""
         return any(
             one.request.camera == camera and one.takes_own and self._subscribers(one.topic) for one in self.known
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame in the forms that need it, copying it once if there are any."""
+        """Queue a frame for the streams that need it, copying it once if any do."""
         camera = header.camera
         wanted = [
             form
@@ -334,7 +334,7 @@ class Streams(Forms[StreamForm]):
             form.put(header, copy)
 
     def own(self, picture: EncodedFrame) -> None:
-        """Publish a picture encoded by the vehicle, unchanged and in the forms that forward it."""
+        """Publish a frame encoded by the vehicle, unchanged and in the streams that forward it."""
         self.publish(picture)
         for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:
@@ -343,14 +343,14 @@ class Streams(Forms[StreamForm]):
                     self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
-        """Handle a subscriber's report; return why it makes no sense, or an empty text."""
+        """Handle a subscriber's report; return why it makes no sense, or an empty string."""
         if (form := self.find(report.topic)) is not None:
             form.report(report, self._clock())
             return ""
         return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is not a stream"
 
     def publish(self, picture: EncodedFrame) -> None:
-        """Publish a picture in as many packets as it needs. Thread-safe."""
+        """Publish a frame in as many packets as it needs. Thread-safe."""
         camera, missed = picture.camera, 0
         for piece in split(picture):
             missed = max(missed, self._publish_packet(picture.topic or f"stream/{camera}", encode(piece)))
@@ -364,7 +364,7 @@ class Streams(Forms[StreamForm]):
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
-    """Return width and height of the encoded picture [px], which are even because colours have half the resolution."""
+    """Return width and height of the encoded image [px], which are even because colours have half the resolution."""
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 

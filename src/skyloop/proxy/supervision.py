@@ -1,11 +1,11 @@
 """React to time, links and the authority during a flight; every decision about it is made under one lock.
 
-The lock is also held while the driver is called. The transport's threads bring commands and requests for the authority
-(:mod:`skyloop.proxy.handler`), the ticker brings the time. The decisions themselves are pure, in
+The lock is also held while the driver is called. The transport's threads deliver commands and requests for the
+authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions themselves are pure, in
 :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing called under the latter two calls back into
-this module; a driver publishes what it receives on any thread without this lock.
+Lock order: this lock first, then the publisher's, then the events'. Nothing called under the last two locks calls back
+into this module; a driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -63,15 +63,15 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
 _NOTICED_M_S: Final = 0.05  #: reductions of the software autopilot's steps that are smaller than this are not reported
-#: Minimum additional sleep of the computer to react to; less can't be distinguished from a delay.
+#: Minimum additional sleep time of the computer that is handled; less can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
 class FlightSupervisor:
-    """Supervises authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
+    """Supervises the authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections, by number of the application; read here and changed by the proxy. ``slept``: returns
-    how long the computer has slept in total [ns].
+    ``sessions``: the connections by application number, read here and changed by the proxy. ``slept``: returns how long
+    the computer has slept in total [ns].
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class FlightSupervisor:
         self._left = False  # the proxy is ending, and makes no more decisions about the flight
         self._pilot = "none"  # "held", or why the authority has no holder
         self._breaks_seen = 0  # number of breaks of the vehicle link at the last check
-        self._heard_ns = -LATEST_NS  # when a tick last noticed that the vehicle is being received
+        self._heard_ns = -LATEST_NS  # time of the last tick that found the vehicle link up
         self._slept = slept
         self._slept_seen = slept()  # value at the last check
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and when it ended
@@ -120,7 +120,7 @@ class FlightSupervisor:
         self._rising_until_ns: int | None = None
         self._drifts = False  # whether the software autopilot drifts, as last reported
         self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
-        self._episodes = Episodes()  # episodes of limits on the proxy's own actions, without a pilot
+        self._episodes = Episodes()  # episodes in which limits reduced the proxy's own actions, without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
         self._stamp()
@@ -171,8 +171,8 @@ class FlightSupervisor:
     def _observe_link(self, now_ns: int) -> None:
         """React to changes of the vehicle link since the last call.
 
-        Intents end when the link breaks and again when it returns, so that nothing old is executed later.
-        Both times a hover is sent, because a driver must not continue an old set-point. A landing continues.
+        Intents end when the link breaks and again when it returns, so that no old command is executed later. Both times
+        a hover is sent, because a driver must not continue an old set-point. A landing continues.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -189,10 +189,10 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Abandon a hover or landing if the vehicle has long been silent, as it may be on another flight by then.
+        """Abandon a hover or landing if the vehicle has long been silent, because it may be on another flight by then.
 
         After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
-        to claim it. Otherwise this is decided when the vehicle is received again, because its pilot may be present.
+        to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may be present.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -215,7 +215,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """React to a sleep of the computer, after which everything is older than its timestamp suggests."""
+        """React to the computer having slept, after which everything is older than its timestamp suggests."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -227,7 +227,7 @@ class FlightSupervisor:
         self._start_over(Fate.SLEPT, now_ns)
 
     def _observe_position(self, now_ns: int) -> None:
-        """Update the vehicle's position; hover if it has jumped, because the request was meant for another place."""
+        """Update the vehicle's position; hover if it has jumped, because the request assumed the old position."""
         airspace = self.checks.airspace
         airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
@@ -325,7 +325,7 @@ class FlightSupervisor:
         return True
 
     def _report_intent(self, session: Session) -> None:
-        """Publish the outcome of an application's newest intent in feedback, soon if it has ended."""
+        """Publish the outcome of an application's newest intent in feedback, promptly if it has ended."""
         self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
@@ -346,7 +346,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow the software autopilot for a step."""
+        """Return the nearest velocity that the limits, safety box and zones allow for the software autopilot's step."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
@@ -357,7 +357,7 @@ class FlightSupervisor:
     # Authority ----------------------------------------------------------------------------------------------------
 
     def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Hover while the authority changes hands, then publish ``news`` and the changes."""
+        """Hover while the authority changes hands, then publish the events in ``news`` and the changes."""
         for effect in effects:
             if not isinstance(effect, Lost | Preempted | Granted):
                 continue
@@ -407,7 +407,7 @@ class FlightSupervisor:
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Let the ladder decide and act; return the events to publish. ``stamps``: the holder has changed."""
+        """Let the ladder decide and act; return the events to publish. ``stamps``: whether the holder has changed."""
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight

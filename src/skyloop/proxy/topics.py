@@ -34,12 +34,12 @@ from skyloop.transport.base import (
 #: Topics that don't contain a name.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
-PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each form of feedback
+PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
-MAX_VARIANTS: Final = 16  #: maximum number of simultaneous forms of feedback, each with any number of subscribers
-#: How long a requested form keeps its place without subscribers, because a subscription may be in transit.
+MAX_VARIANTS: Final = 16  #: maximum number of simultaneous variants of feedback, each with any number of subscribers
+#: How long a requested variant keeps its place without subscribers, because a subscription may be in transit.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
 _FRESH_NS: Final = PERIOD_NS // 2  # an overview younger than this is sent again instead of a new one
@@ -47,7 +47,7 @@ _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, naming the available ones; empty if it can.
+    """Return why a topic can't be subscribed to, naming the available ones; an empty string if it can be.
 
     A processor's results may be subscribed to before it has a worker.
     """
@@ -71,35 +71,35 @@ def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
     return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message
 
 
-# Forms of samples, and feedback at reduced rates -------------------------------------------------------------------
+# Variants of samples, and feedback at reduced rates -------------------------------------------------------------------
 
 
 class Form(Protocol):
-    """A form of samples, published on one topic."""
+    """A variant of samples, published on one topic."""
 
     topic: str
-    asked_ns: int  #: time of the newest request for this form
+    asked_ns: int  #: time of the newest request for this variant
 
 
 F = TypeVar("F", bound=Form)
 
 
 class Forms(Generic[F]):
-    """A limited number of forms that have, or may soon have, subscribers. Thread-safe."""
+    """A limited number of variants that have, or may soon have, subscribers. Thread-safe."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
         self.known: tuple[F, ...] = ()
         self._most = most
         self._subscribers = subscribers
         self._clock = clock
-        self._lock = threading.Lock()  # guards changes of the known forms
+        self._lock = threading.Lock()  # guards changes of the known variants
 
     def find(self, topic: str) -> F | None:
-        """Return the form of a topic; None if it was never requested."""
+        """Return the variant of a topic; None if it was never requested."""
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
-        """Reserve a place for a form, or renew it; return False if all places are taken."""
+        """Reserve a place for a variant, or renew it; return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
             form = self.find(topic)
@@ -114,7 +114,7 @@ class Forms(Generic[F]):
 
 
 class _Variant:
-    """One form of feedback."""
+    """One variant of feedback."""
 
     def __init__(self, topic: str, request: FeedbackRequest) -> None:
         self.topic = topic
@@ -124,7 +124,7 @@ class _Variant:
 
 
 class FeedbackVariants(Forms[_Variant]):
-    """The forms of feedback that have, or may soon have, subscribers."""
+    """The variants of feedback that have, or may soon have, subscribers."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock) -> None:
         super().__init__(MAX_VARIANTS, server.subscribers, clock)
@@ -132,7 +132,7 @@ class FeedbackVariants(Forms[_Variant]):
         self._counts = counters.counts
 
     def problem(self, topic: str) -> str:
-        """Return why a form can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
+        """Return why a variant can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
         try:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
@@ -140,12 +140,12 @@ class FeedbackVariants(Forms[_Variant]):
         if self.claim(topic, lambda: _Variant(topic, request)):
             return ""
         return (
-            f"this proxy sends feedback in at most {MAX_VARIANTS} forms at a time, and all are in use: "
+            f"this proxy sends feedback in at most {MAX_VARIANTS} variants at a time, and all are in use: "
             f"subscribe to {FEEDBACK}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
-        """Publish a sample in each form for which it is due. One thread at a time.
+        """Publish a sample in each variant for which it is due. One thread at a time.
 
         ``now_ns`` is not the capture time, which does not advance while the vehicle is silent.
         """
@@ -157,7 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # in native telemetry, which has been reported already
+            except (ValueError, TypeError, OverflowError):  # due to native telemetry, and reported already
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -215,7 +215,7 @@ class OverviewPublisher:
     def share(self, registry: OverviewRegistry) -> None:
         """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy but not another, as they would see the others' rows.
+        Does nothing if applications may have access to one proxy but not another, because they would see all rows.
         """
         if not self._server.restricted:
             self.registry = registry

@@ -35,7 +35,7 @@ COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: log entries of applications (LogEntry)
 OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
-MAX_TOPIC = 200  #: characters in a topic's name
+MAX_TOPIC = 200  #: maximum number of characters in a topic's name
 MAX_SUBSCRIPTIONS = 64  #: maximum number of simultaneous topics per connection
 RESULTS = "results"  #: results of all processors (ProcessorResult)
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: maximum size of a packet [bytes]
@@ -47,7 +47,7 @@ def video(camera: str) -> str:
 
 
 def stream(camera: str) -> str:
-    """Return the topic of a camera's pictures as encoded by the vehicle (EncodedFrame)."""
+    """Return the topic of a camera's frames as encoded by the vehicle (EncodedFrame)."""
     return f"stream/{camera}"
 
 
@@ -77,13 +77,13 @@ class ServerHandler(Protocol):
     """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, before its first packet. An equal peer identifies it in all later calls."""
+        """Handle a new connection, before its first packet. Later calls identify it by an equal ``Peer``."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle a packet that was not delivered because the sender's keys forbid it; :data:`NOBODY`: unknown."""
+        """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
 
     def topic_problem(self, topic: str) -> str:
         """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.
@@ -114,7 +114,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send a packet to one application; return False if its buffer is full or it is gone."""
+        """Send a packet to one application; return False if it has gone or its buffer is full."""
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
@@ -124,8 +124,8 @@ class TransportServer(ABC):
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
         """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
 
-        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, else :class:`UsageError` is raised;
-        they may be reused after the call.
+        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, otherwise :class:`UsageError` is
+        raised; they may be reused after the call.
         """
 
     @abstractmethod
@@ -150,7 +150,7 @@ class TransportServer(ABC):
 
     @property
     def restricted(self) -> bool:
-        """Whether access to this proxy may not imply access to others, as with keys that name drones."""
+        """Whether access to this proxy need not imply access to others, as with keys that name drones."""
         return False
 
     @property
@@ -160,7 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks: on its receiving thread, one call at a time."""
+    """A transport client's callbacks, called on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -213,14 +213,14 @@ class TransportClient(ABC):
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends read the same monotonic clock, being on one host, so that the offset is zero.
+        """Whether both ends are on one host and read the same monotonic clock, so that the offset is zero.
 
         An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
         """
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive in the form that each topic requests (:class:`skyloop.messages.VideoRequest`).
+        """Whether frames arrive in the format that each topic requests (:class:`skyloop.messages.VideoRequest`).
 
         If not, all frames arrive unchanged, and each camera has only its plain topic.
         """

@@ -12,10 +12,10 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, nearest first, and has its own numbers for their peers.
+    """One transport server that combines several, nearest first, and numbers their peers itself.
 
-    The handler gets one call at a time, as the contract requires: an end that brings a command goes first, the others
-    in order of arrival.
+    The handler gets one call at a time, as the contract requires: an end that has a command goes first, the others in
+    order of arrival.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
@@ -25,7 +25,7 @@ class CompositeServer(TransportServer):
         self.lock = PriorityLock()  #: a thread must hold it to call the handler
         self._members: dict[
             int, tuple[TransportServer, Peer]
-        ] = {}  # by our number: an application's end and peer there
+        ] = {}  # by our number: the end with that application, and its peer there
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:

@@ -208,7 +208,7 @@ class TransportSuite(ABC):
                 server.publish_frame(header(seq), picture(header(seq)))
                 wait_until(partial(app.log.saw, seq), "the frame arrived, whatever views are kept")
                 head, pixels = app.log.frames.pop()
-                if seq % 4 == 0:  # it is kept alive only by a view of a view
+                if seq % 4 == 0:  # the frame is kept alive only by a view of a view
                     views[head.seq] = pixels.reshape(head.height, head.width, 3)[::2, 1::2]
                 del pixels
             app.client.close()
@@ -260,7 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial; an unknown name (``UsageError``) is just as valid as a refused connection, and raises ``LinkError``."""
+        """Dial; convert the error for an unknown name (``UsageError``), which is equally valid, to ``LinkError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

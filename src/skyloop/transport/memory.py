@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-#: A client, and what its server's receiving thread has to tell the handler.
+#: A client, and a call to the handler that the server's receiving thread makes on its behalf.
 _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
@@ -173,8 +173,8 @@ class MemoryClient(TransportClient):
         # Items: a packet, the name of a camera with a frame to deliver, or None if the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # whether either end has ended it, so that nothing can be sent
-        self._closing = False  # whether this end has closed it, so that nothing more is delivered
+        self._ended = False  # whether either end has ended the connection, so that nothing can be sent
+        self._closing = False  # whether this end has closed the connection, so that nothing more is delivered
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:

@@ -43,7 +43,7 @@ class Lane(IntEnum):
 
 
 class PacketBacklog:
-    """Holds the waiting packets of one connection, at most ``most``. Not thread-safe."""
+    """Holds up to ``most`` waiting packets from one connection. Not thread-safe."""
 
     __slots__ = ("_bytes", "_idle", "_last", "_most", "_number", "_set_point", "_waiting")
 
@@ -52,7 +52,7 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may be gone
+        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may have been removed
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -64,7 +64,7 @@ class PacketBacklog:
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the packets up to the first that is not a command; None if there are none."""
+        """The lane of the leading commands or, if there are none, of the first packet; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -90,7 +90,7 @@ class PacketBacklog:
         return superseded
 
     def get(self) -> bytes:
-        """Remove and return the first packet. There must be one."""
+        """Remove and return the first packet. The backlog must not be empty."""
         return self._take(next(iter(self._waiting)))
 
     def _take(self, number: int) -> bytes:
@@ -111,7 +111,7 @@ class PacketBacklog:
     def _drop(self, number: int, newer: Command) -> int:
         """Drop an older command if it is still waiting; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # because a network may reorder packets
+        if older is None or older.seq >= newer.seq:  # a network may have reordered them
             return 0
         self._take(number)
         return 1
@@ -143,7 +143,7 @@ class PriorityLock:
         self._others: deque[tuple[threading.Lock, int]] = deque()
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock, if ``urgent`` before all waiters that are not; the owner may acquire it again."""
+        """Wait for the lock, ahead of all non-urgent waiters if ``urgent``; the owner may acquire it again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the usual case, in as few steps as possible
             self._owner = me
@@ -155,7 +155,7 @@ class PriorityLock:
         woken.acquire()
         with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
-        self._hand_over()  # it may have been released since the first attempt
+        self._hand_over()  # the lock may have been released since the first attempt
         woken.acquire()  # the releaser has made this thread the owner
 
     def release(self, *_: object) -> None:

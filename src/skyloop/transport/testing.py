@@ -22,7 +22,7 @@ FRONT: Final = "front"
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Return as soon as a condition holds, which is tested every millisecond; fail after :data:`PATIENCE_S`."""
+    """Test a condition every millisecond until it holds; fail after :data:`PATIENCE_S`."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, f"after {PATIENCE_S} s still not true: {what}"

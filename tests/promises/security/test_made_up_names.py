@@ -171,10 +171,10 @@ def test_resources_for_a_reader_end_with_it(readers: Readers) -> None:
 def test_the_forms_of_frames_are_bounded_but_the_usual_ones_always_available(readers: Readers) -> None:
     forms = [f"video/front?scale=0.{number:03}" for number in range(100, 200)]
     assert sum(readers.video.subscribe(0, form) for form in forms) == MAX_FORMS_EACH
-    assert f"at most {MAX_FORMS_EACH} forms" in readers.video.problem(0, forms[-1])
+    assert f"at most {MAX_FORMS_EACH} formats" in readers.video.problem(0, forms[-1])
     taken = sum(readers.video.subscribe(number, form) for number, form in enumerate(forms))
     assert taken <= MAX_FORMS
-    assert f"at most {MAX_FORMS} forms" in readers.video.problem("new", forms[-1])
+    assert f"at most {MAX_FORMS} formats" in readers.video.problem("new", forms[-1])
     assert readers.video.subscribe("new", forms[1]), "an existing one costs nothing more"
     for usual in ("video/front", "video/front?encoding=jpeg&quality=80"):
         assert readers.video.subscribe(0, usual)

@@ -133,7 +133,7 @@ class Agreed:
 
 
 class Agreement:
-    """One end's part in the exchange, using its keys. ``terms`` describe the connection, alike at both ends."""
+    """One end's part in the exchange, using its keys; both ends have the same ``terms`` of the connection."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -178,7 +178,7 @@ class Agreement:
             certificates.check_time(certificate, "its key", now or datetime.now(UTC))
             identity = certificates.identity_of(certificate, path)
         except (DecodeError, UsageError) as error:
-            raise LinkError(f"the other end shows no key of this lab: {error}") from None
+            raise LinkError(f"the other end presents no key of this lab: {error}") from None
         if not certificates.signed_by(certificate, claim, proof.signature):
             raise LinkError(f"the other end shows the certificate of {identity.name} but does not have its key")
         if not self._ring.admits(identity):
@@ -199,7 +199,7 @@ def _decode(proof: bytes) -> Proof:
     try:
         return msgspec.msgpack.decode(proof, type=Proof)
     except msgspec.DecodeError:
-        raise LinkError("the other end shows no key: both ends need keys, and a version that shows them") from None
+        raise LinkError("the other end presents no key: both ends need keys, and a version presenting them") from None
 
 
 _WHY: Final = "it was revoked, its rights were changed, or a newer roster is needed here"

@@ -40,7 +40,7 @@ AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
-MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities has 3 MB
+MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities takes 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
 
@@ -85,7 +85,7 @@ class Roster(msgspec.Struct, frozen=True):
 
     @property
     def identities(self) -> list[Identity]:
-        """The identities that may join: all not revoked. The handshake checks whether their certificates are valid."""
+        """All identities that may join (not revoked). The handshake checks whether their certificates are valid."""
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
@@ -163,7 +163,7 @@ class Credentials:
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return what expired or will within a week, this key or the lab's authority, and a sentence on it."""
+        """Return, for this key and the lab's authority, a warning if it has expired or will within a week."""
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
@@ -265,7 +265,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file atomically. A private one is readable only by its owner, from the first byte on."""
+    """Replace a file atomically. A private file is readable only by its owner, from the first byte on."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)

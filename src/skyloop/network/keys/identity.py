@@ -97,7 +97,7 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
     """Create an identity from user input.
 
     The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and is not ``anyone``; ``role`` is a value
-    of :class:`KeyRole`; ``drones`` are names or patterns separated by commas, for a router ``*``.
+    of :class:`KeyRole`; ``drones`` are names or patterns separated by commas; for a router, ``*``.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(

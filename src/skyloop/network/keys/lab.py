@@ -1,4 +1,4 @@
-"""A lab's authority, a folder that issues and revokes identities; and certificates for cockpit pages.
+"""Manage a lab's authority, a folder that issues and revokes identities, and certificates for cockpit pages.
 
 ================  ========================================================================
 ``ca.key``        the authority's private key: its holder can create any identity
@@ -9,7 +9,7 @@
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
 separate authority, in a folder next to the lab's keys. Users have their browsers trust it, which is safe because it
-can't certify anything beyond private networks. Its key gives no access to the lab's network, the lab's none to pages.
+can't certify anything beyond private networks. Its key and the lab's key are not interchangeable.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust
@@ -56,7 +56,7 @@ IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
-FOLDER: Final = "pages"  #: name of the folder for pages within the lab's folder
+FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
 
 PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
 RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left
@@ -111,7 +111,7 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create or renew an identity's key and certificate; a revoked name only after its lost key has expired."""
+        """Create or renew an identity's key and certificate; a revoked name is free once its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
@@ -181,7 +181,7 @@ def page_certificate(
     """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
 
     ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
-    names given by the user, which it must be able to certify.
+    names given by the user, which the authority must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now
     make_directory(directory.parent)

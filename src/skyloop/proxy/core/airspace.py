@@ -24,11 +24,11 @@ from skyloop.zones import Space, Vec3, Wall, Zone
 GRAVITY_M_S2: Final = 9.80665
 LOST_NS: Final = 2 * NS_PER_S  #: age of a position beyond which it is not worth waiting for the next
 BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
-#: A position has jumped if it changes by more than this, and by more than the vehicle can have flown.
+#: A position has jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further beyond, only coming back is allowed
-BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed at which a vehicle is led back if it requests to fly on beyond a wall
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; any further out, only moving back is allowed
+BRAKE_GAIN: Final = 2.0  #: requested deceleration per unit of excess speed [1/s]
+RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further beyond a wall
 #: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
@@ -37,22 +37,22 @@ LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be th
 
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
 _BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
-_OLD_S: Final = 1.0  # maximum age counted for a position, because the vehicle may be at rest
+_OLD_S: Final = 1.0  # maximum age taken into account for a position, because the vehicle may be at rest
 _AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
 _NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
-_PASSES: Final = 8  # how often a velocity is reduced by all walls in turn before a stop is demanded
+_PASSES: Final = 8  # maximum number of times that a velocity is reduced by all walls in turn before a stop is demanded
 
-#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches.
-#: Above the limit, it sinks at the same rate per metre.
+#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches that
+#: altitude. Above the limit, it sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
-#: Altitudes above ``limits.altitude`` by up to this much count as altimeter noise [m].
+#: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
 SLACK_M: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Clamp:
-    """A limit that reduced a set-point. For tilt and speed, the two numbers are lengths of the vector."""
+    """A limit that reduced a set-point. For tilt and speed, the two numbers are the vector's lengths."""
 
     limit: str  #: name of the parameter
     asked: float
@@ -120,7 +120,7 @@ class Verdict(NamedTuple):
 
     action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
     clamps: tuple[Clamp, ...] = ()  #: the limits that applied
-    refusal: Refusal | None = None  #: None if there is no action either: it resumes at the next fresh position
+    refusal: Refusal | None = None  #: None also (like ``action``) if the request only waits for the next fresh position
     why: str = ""  #: readable reason for the refusal
     enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
 
@@ -132,11 +132,11 @@ class Airspace:
         self.settings = settings or AirspaceSettings()
         self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
         self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space when it was permitted
-        self._sinks = self._blocked = False  # whether it is sinking to the ceiling, and whether something is in the way
+        self._sinks = self._blocked = False  # whether the vehicle is sinking to the ceiling, and whether it is blocked
         self._newest: Feedback | None = None
         self._at_ns = 0  # capture time of the newest position, not counting repeats
-        self._moves = False  # whether its last permitted set-point makes it move
-        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # each zone's plane when the vehicle was last outside it
+        self._moves = False  # whether the vehicle's last permitted set-point makes it move
+        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # by zone: the plane nearest the vehicle when last outside
         self._ground: deque[tuple[int, float]] = deque()  # times, and heights of the ground in world axes [m]
 
     def judge(
@@ -144,9 +144,9 @@ class Airspace:
     ) -> Verdict:
         """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
 
-        ``new``: a permitted target stays permitted while nothing else is requested: if drift puts an obstacle in the
-        way, the steps avoid it; a lower ceiling lowers the target. ``planned``: it is part of a route that was checked
-        as a whole, and so may be lowered from the start.
+        Unless the request is ``new``, a permitted target stays permitted: the steps avoid an obstacle that drift puts
+        in the way, and a lower ceiling lowers the target. ``planned``: whether the target is part of a route that was
+        checked as a whole, and so may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -164,7 +164,7 @@ class Airspace:
         return Verdict(action)
 
     def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Reduce a set-point, or a step towards a target, to what limits and walls allow."""
+        """Reduce a set-point, or a step towards a target, to what the limits and walls allow."""
         self.observe(feedback)
         return self._set_point(action, feedback, now_ns)
 
@@ -186,7 +186,7 @@ class Airspace:
         return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
 
     def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
-        """Return why ``limits.altitude`` must not be this low now, as some vehicles descend to it automatically."""
+        """Return why ``limits.altitude`` must not be this low now; some vehicles descend to it automatically."""
         self.observe(feedback)
         if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
             return ""
@@ -203,9 +203,9 @@ class Airspace:
         return other
 
     def observe(self, feedback: Feedback | None) -> None:
-        """Update the vehicle's position: its age, on which side of each zone it is, and the ground below.
+        """Update what is known about the vehicle's position: its age, its side of each zone, and the ground below it.
 
-        ``jumped_m`` is set if the position has changed by more than the vehicle can have flown.
+        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -248,7 +248,7 @@ class Airspace:
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point between the walls, its limits, and whether the position is known.
+        """Return the nearest set-point between the walls, the limits that applied, and whether the position is known.
 
         If it is not, the set-point is unchanged.
         """
@@ -262,7 +262,7 @@ class Airspace:
         walls = self._walls(feedback.position_m)
         turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
         now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
-        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come closer since the measurement
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # the vehicle has moved since
             walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True
@@ -275,7 +275,7 @@ class Airspace:
         walls = [] if space.box is None else list(space.box.walls_inside(at))
         for zone in space.barriers:
             wall = zone.wall_outside(at)
-            # Inside a zone, the nearest plane could be on the far side: keep the one from when it was outside.
+            # Inside a zone, the nearest plane could be on the far side: keep the one from before the vehicle entered.
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
                 wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
@@ -288,7 +288,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
-        # Beyond walls, stop unless the velocity leads back through at least one of them, and further beyond none.
+        # Beyond walls, stop unless the velocity leads back through at least one and no further beyond any other.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
@@ -300,7 +300,7 @@ class Airspace:
                 if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
                     most -= min(1.0, BRAKE_GAIN / 4 * excess)
                 if _dot(asked, wall.normal) <= 0.0:
-                    most = max(0.0, most)  # unless it requests to go there, a vehicle isn't pushed back
+                    most = max(0.0, most)  # a vehicle is pushed back only if its set-point leads towards the wall
                 towards = _dot(wanted, wall.normal)
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
@@ -375,7 +375,7 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        # Only once, because the direction changes near the target.
+        # This is reported only once, because the direction changes near the target.
         if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
@@ -429,11 +429,11 @@ class Airspace:
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """Return the age of the newest position [s], even if it was repeated."""
+        """Return the age of the newest position [s], even if it is a repeat."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Return whether the newest position is fresh enough to fly to a target; between walls, speed matters, too."""
+        """Return whether the newest position is fresh enough to fly to a target; speed matters between walls."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)
@@ -488,7 +488,7 @@ def _add(a: Vec3, b: Vec3, share: float) -> Vec3:
 
 
 def _to_world(body: Vec3, turn: tuple[float, float]) -> Vec3:
-    """Rotate from levelled body axes to world axes; ``turn`` holds cosine and sine of the yaw."""
+    """Rotate from levelled body axes to world axes; ``turn`` holds the cosine and sine of the yaw."""
     c, s = turn
     return c * body[0] - s * body[1], s * body[0] + c * body[1], body[2]
 

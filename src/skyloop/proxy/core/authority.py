@@ -2,7 +2,7 @@
 
 Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
 number is unique in this run. A strictly higher priority takes over at once, or after the holder has been asked. A
-pre-empted pilot waits in the queue, which is ordered by priority and first arrival. A holder that requested the
+pre-empted pilot waits in the queue, which is ordered by priority, then by time of arrival. A holder that requested the
 authority for a limited time loses it once that time is over and the queue isn't empty. See ``docs/proxy.md``.
 """
 
@@ -16,10 +16,10 @@ from skyloop.clock import nanoseconds
 
 @dataclass(frozen=True, slots=True, order=True)
 class QueueEntry:
-    """An application that holds the authority or waits for it. Entries sort in the order in which they get it."""
+    """An application that holds or awaits the authority. Entries sort in the order in which they get the authority."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of its first request since it last neither held nor requested the authority
+    arrival: int  #: number of its first request since it was last neither holder nor in the queue
     app_id: int
     term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
     #: When the holder, which is being asked, will be pre-empted; None if it is not being asked.
@@ -42,7 +42,7 @@ class Granted:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` if its time is over and others wait."""
+    """The lease ended: ``released``, its holder ``silent`` or ``gone``, or ``expired`` while others were waiting."""
 
     app_id: int
     lease: int
@@ -96,7 +96,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """A request to the holder ended, because the other application left the queue or now waits without asking."""
+    """The request to the holder was withdrawn: the other application left the queue or now waits without asking."""
 
     app_id: int  #: the holder
     lease: int
@@ -125,7 +125,7 @@ class Authority:
         self.last_command_ns = 0  #: time of the last valid command from this or an earlier holder
         self._granted_ns = 0  # when the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
-        #: The last holder if it lost the lease by silence; listed until there is a request for the authority.
+        #: The last holder, if it lost the lease by falling silent; listed until someone requests the authority.
         self.silent: QueueEntry | None = None
         self._last_lease = 0
         self._arrivals = 0
@@ -157,7 +157,7 @@ class Authority:
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return how long an application must wait if all others keep to their times; None if one gave no time."""
+        """Return how long an application must wait if all others keep to their times; None if one has no limit."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -188,7 +188,7 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # it must request the authority again, like all others
+            effects.append(self._relieve())  # the application must request the authority again, like all others
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
@@ -211,7 +211,7 @@ class Authority:
         """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` has not asked.
 
         If the answer grants it, the first in the queue gets the authority, and the holder waits with at most the same
-        priority. A refusal is reported; a strictly higher priority still wins once the time for asking is over.
+        priority. A refusal is reported; a strictly higher priority still wins once the holder's time to answer is over.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -246,7 +246,7 @@ class Authority:
                 self.silent = holder
             return effects
         effects = self._settle(now_ns)
-        if self._is_over(now_ns) and not self._expiry_reported:  # the queue is empty, or it would have been relieved
+        if self._is_over(now_ns) and not self._expiry_reported:  # otherwise the next in the queue would have taken over
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects
@@ -263,7 +263,7 @@ class Authority:
     def _dequeue(
         self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
     ) -> tuple[QueueEntry, bool]:
-        """Remove the application's entry from the queue; return it, and whether the holder was being asked."""
+        """Remove the application's entry from the queue; return it, and whether it had asked the holder."""
         known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
         asked_before = known is not None and known.asks(now_ns)
         if known is not None:
@@ -336,7 +336,7 @@ class Authority:
     def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first in the queue if due.
 
-        This is due if there is no holder, its time is over, or an entry with strictly higher priority need not wait.
+        This is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """
         effects: list[Effect] = []
         holder = self.holder

@@ -37,7 +37,7 @@ from skyloop.proxy.core.airspace import Airspace, Clamp
 from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: period of the steps that it is designed for
+PERIOD_S: Final = 0.02  #: period of the steps for which the autopilot is designed
 ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
@@ -53,13 +53,13 @@ LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
 # Return flight:
 NEAR_M: Final = 0.3  #: a vehicle this close, and at rest, has arrived
-CLOSE_M: Final = 1.0  #: close enough if the vehicle gets no closer
+CLOSE_M: Final = 1.0  #: a vehicle this close has arrived if it gets no closer
 AT_REST_M_S: Final = 0.3
 HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this ...
 STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
 #: How long a failsafe tolerates something that prevents a return before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
-CLEARANCE_M: Final = 0.3  #: distance to the ceiling of the room and to the top of the safety box
+CLEARANCE_M: Final = 0.3  #: distance to keep from the ceiling of the room and the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 
 SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
@@ -130,7 +130,7 @@ class Autopilot:
         self._integral = (0.0, 0.0)  # integrals forward and left [rad]
         self._stepped_ns: int | None = None
         self._lifted_ns: int | None = None  # when the take-off left the ground
-        self._from_height: float | None = None  # height according to its position at that time [m]
+        self._from_height: float | None = None  # height according to the position at that time [m]
         self._altitudes: set[float] = set()  # lowest and highest readings since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
@@ -224,7 +224,7 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter always reads the same. If its readings change, but show the vehicle on the ground when time
+        # A stuck altimeter always reads the same. If its readings change but show the vehicle on the ground when time
         # is up, they are right: the motors turn without lifting off, as seen with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
@@ -236,7 +236,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # it may be anywhere when it is next received, and will hold that position
+        if known is None:  # the vehicle may be anywhere when it is next received, and will hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -320,9 +320,9 @@ class StartPoint:
     def __init__(self) -> None:
         self.position: Vec3 | None = None  #: the position [m]; None if unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # when it began to be on the ground; None if it isn't
+        self._standing_ns: int | None = None  # start of the current period on the ground; None in the air
         self._flew = False  # whether it has been seen in the air
-        self._open = False  # whether it is taking off, with its position not known yet
+        self._open = False  # whether the vehicle is taking off and its position is not known yet
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
         """Observe the vehicle; if it briefly reports "landed" while in the air, the start does not change."""
@@ -353,7 +353,7 @@ class ReturnDecision(NamedTuple):
 
     action: Position | Land | None = None  #: the vehicle's next action; None if it must stop
     clamps: tuple[Clamp, ...] = ()
-    refusal: Refusal | None = None  #: None if there is no action either: it continues at the next fresh position
+    refusal: Refusal | None = None  #: None also (like ``action``) if the return only waits for a fresh position
     why: str = ""  #: readable reason for the refusal
     lasting: bool = False  #: whether it is pointless to wait for a fresh position
     enforced: bool | None = None  #: whether safety box and zones were enforced; None if there are none, or no target
@@ -399,7 +399,7 @@ class ReturnFlight:
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return None  # the same for every target
+            return None  # this refusal does not depend on the target
         if self.phase is not ReturnPhase.NONE:
             problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
@@ -418,7 +418,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # If outside the box or inside a zone, don't climb first, because the straight line leads back.
+        # Outside the box or inside a zone, don't climb first, because the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:
@@ -443,7 +443,7 @@ class ReturnFlight:
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
                 self.phase, self._left_m = ReturnPhase.FLYING, math.inf
-                self._target = self._flown = self._over  # judged together with the straight line to it
+                self._target = self._flown = self._over  # it is judged together with the straight line to it
                 return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S

@@ -48,10 +48,10 @@ from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn
-#: A landing that withdrew a take-off is done after this time on the ground, because arming may have been in progress.
+#: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
-_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates whose repeats are refused without explanation
+_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates of intents whose repeats are refused without explanation
 _LANDINGS: Final = (Land, ReturnToStart)
 _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: after these, the next repeat may succeed
 
@@ -69,19 +69,19 @@ class Intent:
     asked_ns: int
     state: FlightState  #: the vehicle's state when it was requested, or last observed
     fate: Fate = Fate.UNDER_WAY
-    begun: bool = False  #: whether the vehicle has started to execute it
-    automatic: bool = False  #: whether the library itself requested it
+    begun: bool = False  #: whether the vehicle has started to execute the intent
+    automatic: bool = False  #: whether the library itself requested the intent
     withdrew: bool = False  #: whether it ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
 
     @property
     def over(self) -> bool:
-        """Whether it has ended, so that repeats have no effect."""
+        """Whether this intent has ended; repeats of it then have no effect."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End it unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
+        """End the intent unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
@@ -89,10 +89,10 @@ class Intent:
             self.fate = fate  # last, because other threads read it without a lock
 
     def refuse(self, reason: Refusal, why: str) -> None:
-        """End it with a refusal.
+        """End the intent with a refusal.
 
-        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. Resets
-        always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
+        Resets always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -100,7 +100,7 @@ class Intent:
             self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
-        """End or complete it according to the vehicle's state; ``shown_ns``: the time of that state, None for now."""
+        """End or complete the intent according to the vehicle's state at ``shown_ns`` (None: now)."""
         before = self.state
         if state is not FlightState.UNKNOWN:  # an unknown state does not replace a known one
             self.state = state
@@ -129,11 +129,11 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """Return its outcome for feedback, given the application's name and the vehicle's state in that feedback.
+        """Return the intent's outcome for feedback, given the application's name and the vehicle's state there.
 
-        A take-off that has just left the ground has no outcome yet: others may have taken the vehicle on its way up.
+        A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
-        fate = self.fate  # read first, because another thread may end it now
+        fate = self.fate  # read first, because another thread may end the intent now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -155,7 +155,7 @@ class Intents:
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
         self._floor = -1  # intents up to this one were ended by an event
-        self._ended = Fate.AUTHORITY  # the fate that this event caused
+        self._ended = Fate.AUTHORITY  # fate of the intents that the event ended
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
@@ -212,7 +212,7 @@ class StatePolicy(Enum):
 
     APPLY = auto()
     HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
-    HOVER = auto()  #: hover instead, for a take-off in flight
+    HOVER = auto()  #: for a take-off requested in flight, hover instead
     REFUSE = auto()
 
 
@@ -224,7 +224,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: If the state is unknown, everything is passed on, because some vehicles never report it.
+#: If the state is unknown, all actions are passed on, because some vehicles never report it.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -241,7 +241,7 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
 class Decision(NamedTuple):
     """The decision on a command that passed the first checks."""
 
-    action: AnyAction | None = None  #: the vehicle's new action (a substitute if refused); None if there is none
+    action: AnyAction | None = None  #: the vehicle's new action (a substitute if the command was refused), or None
     refusal: Refusal | None = None
     why: str = ""  #: readable reason for the refusal
     takes_off: bool = False
@@ -253,7 +253,7 @@ class CommandChecks:
     """Decides how to handle the commands for one vehicle.
 
     ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
-    ``why_not``: why others are not available, as readable text.
+    ``why_not``: readable reasons why other actions are not available.
     """
 
     def __init__(
@@ -276,8 +276,8 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: What a person may command while nothing is received from the vehicle: it may still receive us, and otherwise
-        #: only the emergency stop could bring it down.
+        #: Actions that a person may command while nothing is received from the vehicle. It may still receive us, and
+        #: otherwise only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
@@ -303,7 +303,7 @@ class CommandChecks:
         if new and kind is ReturnToStart:
             self.way_back = None
         if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
-            policy = StatePolicy.HOLD  # it is already landing, which an automatic hover does not abort
+            policy = StatePolicy.HOLD  # an automatic hover does not abort a landing
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
@@ -347,8 +347,8 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Return whether the vehicle's position matters: for a hover in flight, for a take-off on the ground."""
-        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take it back
+        """Return whether the position matters: it does for hovers in flight and for take-offs from the ground."""
+        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take over control
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
@@ -362,7 +362,7 @@ class CommandChecks:
         return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
-        """Return why the vehicle could not start a return with a landing now; empty if it could."""
+        """Return why the vehicle could not start a return flight that ends in a landing now; empty if it could."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""

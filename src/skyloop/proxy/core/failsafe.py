@@ -68,7 +68,7 @@ class FailsafeInputs:
     battery: float | None
     ours: bool = True  #: whether an application of this proxy started the flight or took it over
     return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
-    shown: bool = True  #: whether the state is current; False: the last one from a vehicle that is no longer received
+    shown: bool = True  #: whether the state is current; False: the last state of a vehicle no longer received
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class StepChange:
 
     step: Failsafe
     reason: str
-    returns: bool = False  #: whether it flies back and lands at its start
+    returns: bool = False  #: whether the vehicle flies back to its start and lands there
     why: str = ""  #: readable reason why it does not return although it should
 
 
@@ -135,8 +135,8 @@ class FailsafeLadder:
         self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
         self._overruled = False  # whether the pilot has overruled a return because of the battery
         self._wanted: FailsafeTask | None = None
-        self.given_up = False  #: an abandoned hover or pilot's landing may still be executed by a silent vehicle
-        self.wanted_ns = 0  #: when its current task began
+        self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
+        self.wanted_ns = 0  #: when the current task began
         self._taken = False
         self._next_try_ns = 0
 
@@ -147,7 +147,7 @@ class FailsafeLadder:
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # leave a flight of others alone, whatever its problems
+        if not inputs.ours:  # leave a flight by others alone, whatever its problems
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
@@ -163,7 +163,7 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers keep a landing only while requested
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers continue a landing only while requested
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
@@ -186,7 +186,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery, which ends by a pilot's decision, not a set-point."""
+        """Whether it returns or lands because of a low battery; a pilot's decision ends that, a set-point does not."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
@@ -196,7 +196,7 @@ class FailsafeLadder:
 
     @property
     def continues_landing(self) -> bool:
-        """Whether it continues a pilot's landing."""
+        """Whether the ladder continues a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
     @property
@@ -205,13 +205,13 @@ class FailsafeLadder:
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:
-        """Continue a landing whose pilot leaves, or while the vehicle link is lost."""
+        """Continue a landing whose pilot has left, or while the vehicle link is lost."""
         if not self.lands:
             self._want(Land(), now_ns)
 
     @property
     def acts(self) -> bool:
-        """Whether it makes the vehicle hover or land."""
+        """Whether the ladder makes the vehicle hover or land."""
         return self._wanted is not None
 
     def give_up(self) -> None:
@@ -248,7 +248,7 @@ class FailsafeLadder:
         return []
 
     def _should_return(self, reason: str) -> bool:
-        """Return whether a landing for this reason should take place at the start."""
+        """Return whether a landing for this reason should take place at the starting point."""
         return not self.barred and (reason == "battery_return" or self.settings.returns)
 
     def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:
@@ -274,7 +274,7 @@ class FailsafeLadder:
             return []
         if self._taken and state not in _CONTRADICTIONS[type(wanted)]:
             return []
-        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these manoeuvres end safely without it
+        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these manoeuvres end safely without a hover
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []

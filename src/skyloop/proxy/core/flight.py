@@ -1,4 +1,4 @@
-"""Track one flight: whether the vehicle flies, whose flight it is, how certain both are. Pure: time is an argument.
+"""Track one flight: whether the vehicle is flying, whose flight it is, and how sure that is. Pure: time is an argument.
 
 The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
 mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
@@ -29,7 +29,7 @@ from skyloop.messages import (
 CLAIM_NS: Final = nanoseconds(15.0)
 #: If the vehicle rises in spite of a cancelled take-off, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over when the vehicle has been on the ground for this long, not after bounces or brief false reports.
+#: A flight is over after this time on the ground, so that bounces and brief false reports don't end it.
 STANDING_NS: Final = nanoseconds(1.0)
 #: How long a flight that can't be observed counts as this proxy's; after that, it may be a different one.
 BELIEF_NS: Final = nanoseconds(60.0)
@@ -72,31 +72,31 @@ class Snapshot(NamedTuple):
 
 
 class Flight:
-    """The known state of one vehicle's flight, which others may also fly if it is ``shared``.
+    """The known state of one vehicle's flight; if the flight is ``shared``, others may fly the vehicle as well.
 
     :meth:`state` and :meth:`flies` acquire no lock and change nothing, so any thread may call them. Everything else is
-    called under the command handler's lock. A vehicle steered in software that has no ``native`` take-off and landing
-    has no concept of a flight; its flight state follows from commands and observations.
+    called under the command handler's lock. A vehicle steered in software without ``native`` take-off and landing has
+    no concept of a flight: its flight state is derived from commands and observations.
     """
 
     def __init__(self, native: frozenset[str] = frozenset(), *, shared: bool = True) -> None:
         self._shared = shared
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
-        self.left_to = ""  #: the driver's word for what others made it do
-        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air is on an old run's flight
+        self.left_to = ""  #: what others made the vehicle do, as the driver reports it
+        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air counts as an old run's
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
-        self._grounded_ns: int | None = None  # when it began to be on the ground
-        self._steered = False  # whether it is steered in software, with the task in :attr:`_state`
-        self._state = FlightState.LANDED  # state of a vehicle without a concept of flight, or the steered task
+        self._grounded_ns: int | None = None  # start of the current period on the ground
+        self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
+        self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
         self._begun_ns = 0  # when the steered task began
         self._was_up = False  # whether the vehicle has reported being in the air while steered
-        self._landed_ns: int | None = None  # when it began to report being landed while steered
+        self._landed_ns: int | None = None  # when it first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
-        self._blind_ns: int | None = None  # when a landing ceased to have sensor data
-        self._sent_up = False  # whether the newest action is one for flight
-        self._seen_up = False  # whether it was seen in the air, and not on the ground since
+        self._blind_ns: int | None = None  # when a landing lost its sensor data
+        self._sent_up = False  # whether the newest action makes the vehicle fly
+        self._seen_up = False  # whether it has been seen in the air, and not on the ground since
 
     # Does it fly? ------------------------------------------------------------------------------------------------
 
@@ -116,9 +116,9 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether it flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
+        """Return whether the vehicle flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
 
-        In an unknown state, it flies if it was seen flying, or has been commanded to fly.
+        In an unknown state, it counts as flying if it was seen flying or has been commanded to fly.
         """
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
@@ -135,7 +135,7 @@ class Flight:
 
     @property
     def others(self) -> str:
-        """Readable reason why the vehicle is left alone; empty if it is not flown by others."""
+        """Readable reason why the vehicle is left alone; empty if no one else is flying it."""
         if self.whose is not Whose.OTHERS:
             return ""
         if self.left_to:
@@ -148,7 +148,7 @@ class Flight:
         return self._believed_until_ns is not None
 
     def began_before(self, until_ns: int) -> None:
-        """Assume that a vehicle found in the air until then is on a flight from an earlier run."""
+        """Assume that a vehicle found in the air before this time is on a flight from an earlier run."""
         self._believed_until_ns = until_ns
 
     def claim(self, now_ns: int) -> None:
@@ -158,7 +158,7 @@ class Flight:
             self.whose = Whose.OURS
 
     def call_off(self, now_ns: int) -> None:
-        """Record that a take-off without visible effect yet has been cancelled."""
+        """Record that a take-off has been cancelled before it had a visible effect."""
         if self._claimed_until_ns is not None:
             self._claimed_until_ns = min(self._claimed_until_ns, now_ns + CALLED_OFF_NS)
 
@@ -173,7 +173,7 @@ class Flight:
         return self._shared
 
     def slept(self, ns: int) -> None:
-        """Handle a sleep of the computer, which its clock does not count: it may be another flight by now."""
+        """Allow for the time that the computer slept without its clock running: a different flight may be under way."""
         if self._believed_until_ns is not None:
             self._believed_until_ns -= ns
         if self._claimed_until_ns is not None:
@@ -215,7 +215,7 @@ class Flight:
         """Observe a vehicle without a concept of flight while it is not steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
-            if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot flies it past its driver
+            if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot bypasses the driver
                 self._state = FlightState.LANDED
         elif reported is FlightState.UNKNOWN and begins_high and self._state is FlightState.LANDED:
             self._state = FlightState.FLYING  # the proxy may have restarted during the flight
@@ -233,7 +233,7 @@ class Flight:
 
     def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver has reported who took it, the flight is over, or it can only be ours
+            return ""  # the driver has said who took over, the flight is over, or no one else can fly the vehicle
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
@@ -271,15 +271,15 @@ class Flight:
         return True
 
     def lifted(self, reported: FlightState) -> bool:
-        """Return whether it has left the ground in a take-off, or does not report that."""
+        """Return whether the vehicle has left the ground in a take-off, or never reports that it has."""
         return not self._has_no_notion or self._was_up or reported is not FlightState.LANDED
 
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
         """Return whether the steered task has ended on the ground, so that the vehicle is no longer steered.
 
-        If the vehicle reports its state, that counts. Otherwise a descent has reached the ground when the altimeter,
-        near the ground, shows no progress. A landing without either continues for :data:`BLIND_NS`, and its result is
-        unknown. ``feedback``: as in :meth:`observe`.
+        If the vehicle reports its state, that report counts. Otherwise, a descent has reached the ground when the
+        altimeter reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and
+        its result is unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:
@@ -287,7 +287,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # It may be about to rise, so reports from before the command prove nothing.
+            # The vehicle may be about to rise, so reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

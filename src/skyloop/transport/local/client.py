@@ -28,13 +28,13 @@ _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is sligh
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # interval of retries for packets that did not fit into a full socket
 _CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over if nothing arrives
-_STAND_BY_S: Final = 0.002  # how long to let no thread receive after the leading thread has returned with its sample
+_STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread has returned with its sample
 _MAX_CAPACITY: Final = 1 << 31  # maximum memory that a client maps for a server
 _log = logging.getLogger(__name__)
 
 
 class LocalClient(TransportClient):
-    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns; receives at once."""
+    """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`; it receives at once."""
 
     # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
     # for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing it to another thread takes
@@ -279,7 +279,7 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """A client's view of one slot, mapped once and read-only."""
+    """A client's view of one slot, which is mapped once and read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 

@@ -203,7 +203,7 @@ def _default_path() -> Path:
     import platformdirs
 
     with warnings.catch_warnings():
-        # Ignore the warning about a missing XDG_RUNTIME_DIR, as the safety of the fallback is checked here.
+        # Ignore the warning about a missing ``XDG_RUNTIME_DIR``, because the safety of the fallback is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 

@@ -27,8 +27,8 @@ from skyloop.transport.local import packets
 
 MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, in transit or in use
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# After mapping the memory, the server keeps its own writeable view; no other can be created, nor the size changed. If a
-# slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
+# Once the server has mapped the memory, it keeps that writeable view; no other can be created, and the size can't be
+# changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
@@ -38,12 +38,12 @@ class SlotMemory:
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
-        """Reserve the memory [bytes]. Raises ``OSError`` if there is too little, or no descriptor is left."""
+        """Reserve the memory [bytes]. Raises ``OSError`` if memory or descriptors run out."""
         self.fd = -1
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that hold it, plus the server while it writes to it or keeps it for viewers
+        self.holders = 0  #: clients that hold the slot, plus the server while it writes to it or keeps it for viewers
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.posix_fallocate(self.fd, 0, capacity)  # fail here if memory is short, rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -86,8 +86,8 @@ class Viewer:
     leases: dict[int, SlotMemory] = field(default_factory=dict)
     announced: set[int] = field(default_factory=set)
     retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
-    active: bool = True  #: whether it gets frames; if not, it may still hold some
-    waits: bool = False  #: whether it was skipped, and waits for a frame
+    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some
+    waits: bool = False  #: whether the viewer was skipped and is waiting for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
         """Send a frame, unless the viewer holds enough frames or its socket is full; then mark it as waiting."""
@@ -184,7 +184,7 @@ class Camera:
         """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
-        with contextlib.suppress(OSError):  # if this fails, it keeps the slots mapped until it ends
+        with contextlib.suppress(OSError):  # if this fails, the client keeps the slots mapped until it ends
             viewer.connection.transmit(packets.retire(self.number, self._next_number))
         self._trim()
 
@@ -205,7 +205,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Free the memory of all slots, or of slots in use as soon as they are released."""
+        """Free the memory of every slot: at once if it is free, otherwise as soon as it is released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -276,5 +276,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # it is recreated for the next viewer, because unused names must not accumulate
+                if not camera.viewers:  # recreated for the next viewer, because unused names must not accumulate
                     del self._cameras[name]

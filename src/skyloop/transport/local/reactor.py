@@ -33,14 +33,14 @@ _AFTER_FAILURE_S: Final = 0.01
 _PAUSE_S: Final = 100e-6  # a wait this long means that nothing was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: Which lanes go first, turn by turn: even if something is always urgent, the others each get one turn in four.
+#: Order of the lanes, turn by turn: even if something is always urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
     _FIRST_COME,
     (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
 )
-_THREAD_CHECK_S: Final = 0.1  # how often a wait for connections checks whether their thread has ended
+_THREAD_CHECK_S: Final = 0.1  # interval at which a wait for connections checks whether their thread has ended
 _log = logging.getLogger(__name__)
 
 
@@ -55,9 +55,9 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: the lane in which it waits
+        self.lane: Lane | None = None  #: the lane in which the source waits
         self.ended = False
-        self.muted = False  #: whether it is ignored until the next check
+        self.muted = False  #: whether the source is ignored until the next check
 
 
 class _Thread(threading.Thread):
@@ -69,7 +69,7 @@ class Reactor:
 
     def __init__(self) -> None:
         self.inside: SharedLocalServer | None = None  #: the server whose handler is, or may be, running
-        self.entries = 0  #: how often :attr:`inside` was set
+        self.entries = 0  #: number of times that :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
         self._epoll = select.epoll()
@@ -114,7 +114,7 @@ class Reactor:
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to the server whose handler blocks it; return a new one for all others. Thread-safe.
+        """Leave this reactor to the server whose handler blocks it; return a new reactor for all others. Thread-safe.
 
         No packet is lost or delivered twice, and the packets of each connection keep their order.
         """
@@ -160,7 +160,7 @@ class Reactor:
                 self.inside = None
             begun_s = time.monotonic()
             ready = self._epoll.poll(0 if busy else CHECK_S)
-            # After a pause, a single packet is most likely alone. If there are many, checking each socket for another
+            # After a pause, a packet is most likely the only one. If there are many, checking each socket for another
             # one would cost a system call each; instead, all sockets are polled together until nothing new arrives.
             waited = time.monotonic() - begun_s > _PAUSE_S
             try:
@@ -198,12 +198,12 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Queue a source for a turn in a lane, or for None, in no lane. On the reactor's thread."""
+        """Queue a source for a turn in a lane; do nothing if there is no lane. Called on the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
     def _deliver(self) -> None:
-        """Handle one packet of the source whose turn it is."""
+        """Handle one packet from the source whose turn it is."""
         self._turns += 1
         for lane in _ORDERS[self._turns % len(_ORDERS)]:
             waiting = self._lanes[lane]
@@ -246,7 +246,7 @@ class SharedLocalServer(LocalServer):
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
         super().__init__(name, group=group)
-        self.reactor = reactor  #: the reactor that receives for it at present
+        self.reactor = reactor  #: the reactor that currently receives for this server
         self._handler: ServerHandler | None = None
         self._listening: Source | None = None
         self._inode = 0
@@ -280,7 +280,7 @@ class SharedLocalServer(LocalServer):
     def _drop(self, source: Source) -> None:
         """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # a socket in transit to another reactor is dropped there as soon as it is seen
+        self.reactor.remove(source)  # a socket moving to another reactor is dropped there as soon as it is noticed
 
     # --- the reactor's thread ---
 
@@ -290,7 +290,7 @@ class SharedLocalServer(LocalServer):
         ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
         :meth:`deliver`.
         """
-        with self._lock:  # held from receiving to handling, so that after a split nothing overtakes this packet
+        with self._lock:  # held from receiving to handling, so that nothing overtakes this packet after a split
             if not self._is_current(reactor, source):
                 return False
             connection = source.connection
@@ -317,10 +317,10 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first waiting packet of a source from this lane; return the lane in which to queue it again."""
+        """Handle the first waiting packet of a source from this lane; return the source's next lane."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
-                return None  # it has become more urgent and moved to that lane
+                return None  # the source has become more urgent and moved to that lane
             source.lane = None
             connection = source.connection
             if connection is None or not connection.backlog:
@@ -374,7 +374,7 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # it connected while the others were being disconnected
+            if self._stopping.is_set():  # connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:

@@ -36,9 +36,9 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Connections per process, so that no program can take them all; a cockpit's page that flies has its own connection.
+#: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: the same per user with access through a group; the proxy's own user may use all others
+MAX_PER_USER: Final = 64  #: maximum per user with access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: places reserved for pilots
 HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send when they connect
 _RETRY_ACCEPT_S: Final = 0.2
@@ -62,11 +62,11 @@ class LocalServer(TransportServer):
         self._exchange = FrameExchange()
         # These are replaced under the lock, never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
-        self._peers: dict[int, ServerConnection] = {}  # by number of the peer
+        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # a thread must hold it to call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # number of commands replaced by newer ones behind them
+        self._superseded = 0  # number of commands replaced by newer ones that arrived behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -217,7 +217,7 @@ class LocalServer(TransportServer):
         return connection
 
     def _make_room(self, who: Credentials) -> str:
-        """Make room for a new connection; return why there is none, or an empty text.
+        """Make room for a new connection; return why there is none, or an empty string.
 
         If all places are taken, the oldest connection that has not identified itself gives way, so that such
         connections can't keep others out, however many there are.
@@ -258,7 +258,7 @@ class LocalServer(TransportServer):
             try:
                 packet = receive(MAX_PACKET + 1)
             except ConnectionResetError:
-                continue  # packets sent before it still arrive, and then the end
+                continue  # packets sent earlier still arrive, followed by the end
             except BlockingIOError:
                 return f"it sent no Hello within {HELLO_S:g} s"
             except OSError as error:
@@ -268,7 +268,7 @@ class LocalServer(TransportServer):
             lock.acquire(is_command(packet))
             try:
                 more = connection.pilot and poll(0)
-                if more:  # it had to wait, so packets that have arrived since may supersede it
+                if more:  # the packet had to wait, so packets that have arrived since may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
@@ -284,12 +284,12 @@ class LocalServer(TransportServer):
                 return reason
 
     def _next(self, connection: ServerConnection) -> bytes:
-        """Read all waiting packets, and return the one to handle first. The lock is held."""
+        """Read all waiting packets, and return the one to handle first. The caller holds the lock."""
         self._superseded += connection.take_in()
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why it ends the connection, or an empty text. The lock is held."""
+        """Handle one packet; return why it ends the connection, or an empty string. The caller holds the lock."""
         if not packet or connection.ending:
             # An empty packet can't be distinguished from the end of the connection, so it is treated as such.
             return f"the application is gone ({connection.peer.address})"

@@ -23,7 +23,7 @@ SEND_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: flags for callers that wait by other means
 _SO_PEERGROUPS: Final = 59  # Linux 4.13; missing from Python's socket module
 _CREDENTIALS: Final = struct.Struct("3i")
-_MAX_OPTION: Final = 1024  # Python's limit for an option [bytes], which is 256 groups
+_MAX_OPTION: Final = 1024  # Python's limit for a socket option [bytes], enough for 256 groups
 
 
 class Socket(socket.socket):
@@ -49,7 +49,7 @@ class Socket(socket.socket):
         if last_packet:
             with suppress(OSError):
                 self.send(last_packet, SEND_FLAGS)
-        with suppress(OSError):  # it had already ended
+        with suppress(OSError):  # the connection had already ended
             self.shutdown(socket.SHUT_RDWR)
 
 
@@ -80,7 +80,7 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the connecting process has access: as our own user, the superuser, or a member of the group."""
+    """Return whether the connecting process has access: it is our own user's, the superuser's or a group member's."""
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
@@ -95,13 +95,13 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long calls block [s], by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; after that, ``EAGAIN``; 0: no limit."""
+    """Limit how long calls block [s] before ``EAGAIN``, by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; 0: no limit."""
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
 
 class ServerConnection:
-    """An application's connection. Any thread may send without waiting; the rest belongs to its receiving thread."""
+    """An application's connection. Any thread may send without waiting; everything else is for its receiving thread."""
 
     def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
@@ -114,11 +114,11 @@ class ServerConnection:
         self.poll = poll.poll  #: returns whether a packet, or the end, is waiting; for the receiving thread
         self.backlog = PacketBacklog()  #: packets taken from the socket, but not handled yet
         self.peer = peer
-        self.joined = False  #: whether it has sent Hello, and the handler knows it
-        self.admitted = False  #: whether it has identified itself, and the handler has admitted it
+        self.joined = False  #: whether the application has sent Hello, and the handler knows it
+        self.admitted = False  #: whether the application has identified itself, and the handler has admitted it
         self.pilot = False  #: whether it connected as a pilot
-        self.ending = False  #: whether the server is ending it, so that earlier packets no longer count
-        self.reason = ""  #: why it ends, once one end has given a reason
+        self.ending = False  #: whether the server is ending the connection, so that earlier packets no longer count
+        self.reason = ""  #: why the connection ends, once either end has given a reason
         self.topics: set[str] = set()
 
     def fileno(self) -> int:
@@ -126,7 +126,7 @@ class ServerConnection:
         return self._socket.fileno()
 
     def more(self) -> bool:
-        """Return whether a pilot's packet, or the end, is waiting in the socket; others can't command anyway."""
+        """Return whether a pilot's packet, or the end, is waiting in the socket; other clients can't command anyway."""
         return self.pilot and bool(self.poll(0))
 
     def take_in(self) -> int:
@@ -148,11 +148,11 @@ class ServerConnection:
         return superseded
 
     def limit_silence(self, seconds: float) -> None:
-        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0: for ever."""
+        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``; 0 means forever."""
         set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
 
     def transmit(self, packet: bytes) -> None:
-        """Send a packet without waiting. Any thread. ``OSError``: the application's buffer is full, or it is gone."""
+        """Send a packet without waiting. Any thread. ``OSError``: the application has gone, or its buffer is full."""
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
