@@ -82,11 +82,11 @@ class FoxgloveServer:
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
         self._chains: dict[str, Chain] = {}  # H.264 sent to viewers so far, by topic
-        self._ready = threading.Event()  # set once self._server exists: viewers may connect earlier
+        self._ready = threading.Event()  # set once ``self._server`` exists, because viewers may connect before that
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
         self._parameters = ParameterAccess(drones, priority, self._parameter_changed)
-        self._guard: OriginGuard | None = None  # used if parameters can be written: else any web page could connect
+        self._guard: OriginGuard | None = None  # set if parameters can be written; otherwise any web page could connect
         hidden = hidden_host()
         try:
             if priority is not None:
@@ -276,7 +276,7 @@ class ViewTopic:
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
-    """Yield a drone's topics; the frames of a ``far`` drone are encoded for the network."""
+    """Yield a drone's topics. ``far`` means that the drone's frames are encoded for the network."""
     for channel, kind in layout.TYPES.items():
         if channel not in _OTHERS:
             yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))

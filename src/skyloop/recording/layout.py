@@ -30,7 +30,7 @@ from skyloop.messages import (
 )
 from skyloop.recording.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 
-__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # from plain, for other modules
+__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # re-exported for other modules
 
 T = TypeVar("T")
 
@@ -110,7 +110,7 @@ class Start(msgspec.Struct, frozen=True):
     layout: int
     skyloop: str  #: Skyloop's version
     drones: tuple[DroneRecord, ...]
-    started_unix_ns: int  #: start of the whole recording; equal in all its files
+    started_unix_ns: int  #: start of the whole recording; the same in all its files
     file: int = 1  #: this file's number within the recording, starting at 1
     options: dict[str, Any] = {}  #: recorder options: channels, encoding, quality
 
@@ -217,7 +217,7 @@ TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """The parts of one of Skyloop's own topics."""
+    """The components of the name of one of Skyloop's own topics."""
 
     drone: str
     channel: Channel
@@ -239,7 +239,7 @@ def parse_topic(topic: str) -> Topic | None:
 
 
 def image_topic(drone: str, camera: str) -> str:
-    """Return the topic of a camera's images, foxglove.CompressedImage."""
+    """Return the topic for a camera's images (foxglove.CompressedImage)."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
 
 

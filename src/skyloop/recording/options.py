@@ -55,7 +55,7 @@ class Options(msgspec.Struct, frozen=True):
         return self.rotate_mb is not None or self.rotate_s is not None
 
     def wants(self, channel: Channel) -> bool:
-        """Return whether a channel that has no camera is recorded."""
+        """Return whether to record a channel that does not belong to a camera."""
         return channel.value in self.channels
 
     def wants_camera(self, camera: str) -> bool:
@@ -139,10 +139,10 @@ class Status(msgspec.Struct, frozen=True):
 
     state: RecorderState = RecorderState.STARTING
     reason: str = ""  #: why it is paused, has failed or is leaving frames out
-    path: str = ""  #: the current file, or the last one
+    path: str = ""  #: the current file or, if there is none, the last one
     files: tuple[str, ...] = ()  #: all files, oldest first
     seconds: float = 0.0  #: time since the start
-    bytes: int = 0  #: in all files together
+    bytes: int = 0  #: total size of all files
     messages: int = 0
     waiting: int = 0  #: bytes received but not written yet
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
@@ -157,7 +157,7 @@ class RecorderEvent(msgspec.Struct, frozen=True):
 
 
 class Room(StrEnum):
-    """What is still written as the disk fills up."""
+    """The samples that are still written as the disk fills up."""
 
     ALL = "all"
     NO_FRAMES = "no frames"

@@ -108,7 +108,7 @@ class Recording:
 
     @property
     def damaged(self) -> list[str]:
-        """The unreadable parts found so far, in words."""
+        """Descriptions of the unreadable parts found so far."""
         return [*self.found.damaged, *(f"{count} × {what}" for what, count in self._bad.items())]
 
     @property
@@ -351,7 +351,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # decoding a picture that has no group raises
+            with suppress(FileFormatError):  # raised when decoding a picture without a group
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 

@@ -107,7 +107,7 @@ class RerunViewer:
         self._ahead = 0  # bytes that the viewer may not have accepted yet
         self._stalled = False
         self._due_ns = 0
-        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 shown so far
+        self._chains: dict[tuple[int, str], Chain] = {}  # the H.264 frames shown so far
         clock = ClockPair.now()
         self._channels = frozenset(
             (number, channel)
@@ -288,7 +288,7 @@ TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
 _MOST_SERIES: Final = 64  # maximum number of series and of drawing sources, because applications choose their names
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between points of a path
-_FRUSTUM_M: Final = 0.3  # drawn size of a camera
+_FRUSTUM_M: Final = 0.3  # size at which a camera is drawn
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _STATE: Final[dict[str, tuple[str, ...]]] = {
     "attitude": ("roll [rad]", "pitch [rad]", "yaw [rad]"),
@@ -543,7 +543,7 @@ class _Drone:
         if entity not in self._titled:
             self._titled.add(entity)
             self._stream.log(entity, self._rr.SeriesLines(names=list(names)), static=True)
-        values = [math.nan if number is None else number for number in numbers]  # drawn as a gap
+        values = [math.nan if number is None else number for number in numbers]  # NaN is drawn as a gap
         self._stream.log(entity, self._rr.Scalars(values))
 
     def _text(self, text: str, severity: Severity) -> None:

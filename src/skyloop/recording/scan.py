@@ -25,7 +25,7 @@ MAX_CHUNK: Final = 64 << 20
 #: Maximum compression ratio of a chunk. LZ4 reaches at most 255, and nearly constant data 150.
 MAX_RATIO: Final = 512
 MAX_RECORD: Final = 8 << 20  #: bytes in a metadata record, a schema or a channel; Skyloop's have a few kilobytes
-#: Bytes of metadata, schemas and channels, which are kept in memory. A recording of 100 drones has about 1 MB.
+#: Bytes of metadata, schemas and channels, which are kept in memory. In a recording of 100 drones they take about 1 MB.
 MAX_HEAD: Final = 32 << 20
 MAX_PIECES: Final = 500_000  #: chunks in a file; a recorder that closes one per second gets there after five days
 MAX_RECORDS: Final = 5_000_000  #: records outside chunks; Skyloop's recordings have a few hundred
@@ -61,11 +61,11 @@ class Piece:
     """A chunk, or a run of messages outside chunks."""
 
     offset: int  #: offset of the chunk's data, or of the first record in the run
-    size: int  #: in the file
+    size: int  #: size in the file [bytes]
     start_ns: int = 0  #: log times of its first and last messages; 0 if unknown
     end_ns: int = 0
     compression: str | None = None  #: a chunk's compression, ``""`` if it is not compressed; None for a run of messages
-    crc: int | None = 0  #: 0 if there is none; None if it has not yet been read from the chunk's head
+    crc: int | None = 0  #: checksum; 0 if there is none, None if it has not yet been read from the chunk's head
     unpacked: int = 0  #: uncompressed size of a chunk's records, as announced
     cut: bool = False  #: whether the file ends within it
 
@@ -82,7 +82,7 @@ class Scan:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
     cut: str = ""  #: why the file is incomplete, in words; empty for a file with an index and an end
-    damaged: list[str] = field(default_factory=list)  #: unreadable parts, in words
+    damaged: list[str] = field(default_factory=list)  #: descriptions of unreadable parts
     head: int = 0  #: bytes of metadata, schemas and channels kept in memory
 
     def damage(self, what: str) -> None:
@@ -287,14 +287,14 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """Decompress a chunk's records, or the existing part of a truncated chunk if its compression allows that.
+    """Decompress a chunk's records; of a truncated chunk, those that the compression format allows to be recovered.
 
     Decompress no more than the chunk announces, and nothing if it announces too much.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
         raise ValueError(
-            f"{len(data)} bytes that announce {size} unpacked, but the limits are {MAX_RATIO} times as many and "
+            f"{len(data)} bytes that announce {size} when unpacked, but the limits are {MAX_RATIO} times as many and "
             f"{MAX_CHUNK} in all"
         )
     size = min(size, MAX_CHUNK, MAX_RATIO * len(data))
@@ -317,7 +317,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
     else:
         raise ValueError(f"its compression {piece.compression!r} is neither zstd nor lz4")
     if len(unpacked) > size and not piece.cut:
-        raise ValueError(f"it holds more than the {size} bytes that it announces")
+        raise ValueError(f"it contains more than the {size} bytes that it announces")
     if piece.crc and not piece.cut and zlib.crc32(unpacked) != piece.crc:
         raise ValueError("its checksum is wrong")
     return unpacked
@@ -333,7 +333,7 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
         if at + FRAME.size > size:
             return
         if number >= most:
-            raise ValueError(f"more than {most} records in as many bytes: the others are left out")
+            raise ValueError(f"more than {most} records in as many bytes; the rest are skipped")
         opcode, length = FRAME.unpack_from(data, at)
         begin = at + FRAME.size
         at = begin + length
@@ -426,7 +426,7 @@ def _header_end(file: IO[bytes]) -> int:
 
 
 def _summary(found: Scan, file: IO[bytes]) -> tuple[bytes, int] | None:
-    """Return the summary section and where the data before it end; None if it is missing or damaged."""
+    """Return the summary section and the offset where the data before it end; None if it is missing or damaged."""
     at = found.size - _TAIL
     if at < 0:
         return None
@@ -453,7 +453,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         opcode, length = FRAME.unpack_from(data, at)
         at += FRAME.size + length
         if at > len(data):
-            raise ValueError("a record is longer than the summary")
+            raise ValueError("a record extends beyond the summary")
         yield opcode, data[at - length : at]
 
 

@@ -1,4 +1,4 @@
-"""Subscribe to drones, to record or to show them: samples go to a backlog, frames through an encoder."""
+"""Subscribe to drones in order to record or show them: samples go to a backlog, frames through an encoder."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ class Video:
             self._thread.join()
 
     def check_stream(self, now_ns: int) -> None:
-        """Subscribe to frames while the vehicle's stream does not arrive (it may differ from what was announced)."""
+        """Subscribe to frames while the vehicle's stream is not arriving (it may differ from what was announced)."""
         if self._stream is not None:
             self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
 
@@ -419,7 +419,7 @@ class Parameters:
 BEAT_S: Final = 0.02  #: interval between polls of the backlog; polling spares receiving threads from waking the view
 _BATCH: Final = MB  # bytes to show before asking the screen again which sources it needs
 _LIMIT: Final = 16 * MB  # bytes held for a slow screen; older images are useless to a viewer
-_RESERVE: Final = 16 * MB  # bytes above that limit for samples that must not be dropped
+_RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
 _LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the streams
 NICENESS: Final = 5
@@ -450,7 +450,7 @@ class View:
         """
         check_names(drones, "view")
         self.failed = 0  #: number of samples that could not be shown
-        self.failed_why = ""  #: channel and error of the last one
+        self.failed_why = ""  #: channel and error of the last such sample
         self._drones = drones
         self._screen = screen
         self._backlog = Backlog(_LIMIT, _RESERVE)
@@ -529,6 +529,6 @@ class View:
 
 
 def give_way() -> None:
-    """Lower the priority of this process and of threads that it starts later, because the flight has priority."""
+    """Lower the priority of this process and of threads that it starts later, so that flying takes precedence."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)

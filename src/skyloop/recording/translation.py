@@ -68,7 +68,7 @@ class Schema:
 
 @dataclass(slots=True, eq=False)
 class Picture:
-    """A frame in the form written to the file."""
+    """A frame as it is written to the file."""
 
     record: FrameRecord
     data: bytes

@@ -107,7 +107,7 @@ class RecordingFile:
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
-        """Create the file and write its metadata. ``clock`` relates monotonic to Unix time.
+        """``clock`` relates monotonic time to Unix time.
 
         Raise ``OSError`` if the file can't be created or written.
         """
@@ -168,7 +168,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Close the file as it is, readable up to the last commit but without a summary. Remove it if it is empty."""
+        """Close the file, which is readable up to the last commit but has no summary, and remove it if it is empty."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)
@@ -275,7 +275,7 @@ class FileWriter:
 
     @property
     def path(self) -> Path:
-        """The current file, or the last one."""
+        """The current file or, if there is none, the last one."""
         return self.files[-1] if self.files else self._path
 
     @property

@@ -216,7 +216,7 @@ def test_the_connection_to_a_silent_drone_is_retried() -> None:
     with TcpPort(play) as port, receiving(viewer, port.port, clock=clock) as receiver:
         viewer.wait(lambda: len(viewer.texts(VideoEvent.STREAMING)) == 2, "a second connection")
         assert receiver.counters.lost_bytes > 0
-    assert viewer.texts(VideoEvent.LOST)[0].endswith("no frame came for 3 s")
+    assert viewer.texts(VideoEvent.LOST)[0].endswith("no frame arrived for 3 s")
 
 
 def test_an_unsupported_codec_is_reported_once() -> None:

@@ -259,7 +259,7 @@ def test_bad_options_are_refused(query: str, message: str) -> None:
 
 
 def test_an_address_without_a_file_is_refused() -> None:
-    with pytest.raises(UsageError, match="names no file"):
+    with pytest.raises(UsageError, match="names neither a file nor a camera"):
         make_driver("video://")
 
 
@@ -299,7 +299,7 @@ def _sound(folder: Path) -> Path:
         (lambda folder: folder / "shot%2503d.png", UsageError, "shot%03d.png cannot be opened"),
         (_text, FileFormatError, "notes.mp4 cannot be opened as a video"),
         (_empty, FileFormatError, "empty.mkv cannot be opened as a video"),
-        (_no_pave, FileFormatError, "noise.pave holds no frame of a PaVE stream"),
+        (_no_pave, FileFormatError, "noise.pave contains no PaVE frame"),
         (_sound, FileFormatError, "sound.wav holds no video stream"),
     ],
 )

@@ -36,7 +36,7 @@ class Line:
     values: Floats
     style: str = "c1"
     dashed: bool = False
-    steps: bool = False  #: draw steps: each value holds until the next one
+    steps: bool = False  #: whether to draw steps, which hold each value until the next one
 
 
 @dataclass(frozen=True, slots=True)

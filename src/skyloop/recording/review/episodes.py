@@ -55,7 +55,7 @@ class Form:
 class Episode:
     """One flight, or a part of one marked by the application."""
 
-    task: str  #: the task, in words
+    task: str  #: description of the task
     state: Floats  #: state when the first camera's image was captured, shape (rows, len(form.state)), float64
     #: action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64
     action: Floats
@@ -95,12 +95,12 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     """Cut a recording into episodes.
 
     An episode lasts while the drone follows set-points without a gap in images or state, and is cut at marks. Its rows
-    are ``1 / form.fps`` apart. Each has the newest image from every camera, the state at the first camera's capture
-    time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering counts as
-    a set-point of zeros. If an application logs arrays named ``action``, these are used as the actions instead: each
-    row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``: name of the task
-    where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError`` if a logged
-    action has a different number of values than the form's set-points.
+    are ``1 / form.fps`` apart. Each contains the newest image from every camera, the state at the first camera's
+    capture time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering
+    counts as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
+    instead: each row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``:
+    name of the task where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError``
+    if a logged action has a different number of values than the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -228,7 +228,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's images from all episodes at a steady rate, in an H.264 MP4 file, which an error removes."""
+    """An H.264 MP4 file with one camera's images from all episodes at a steady rate. An error removes it."""
 
     def __init__(self, path: Path, fps: float) -> None:
         #: number of rows that repeat the previous image because theirs could not be decoded
@@ -303,7 +303,7 @@ class Film:
         if (width, height) != (self.width, self.height):
             raise UsageError(
                 f"{path} has images of {width}×{height}, the first ones were {self.width}×{self.height}: "
-                "export recordings that don't match separately"
+                "export mismatched recordings separately"
             )
         if self._rows % _LOOKED_AT_EVERY == 0:
             self._looked_at.append(image[::_THINNED, ::_THINNED].copy())

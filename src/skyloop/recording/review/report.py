@@ -68,7 +68,7 @@ def write_report(
 
 
 def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
-    """Create the head of the page, the path and the charts over time."""
+    """Create the page with its header, the path and the charts over time."""
     ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)
@@ -302,7 +302,7 @@ class Way:
 def way_of(feedback: Table) -> Way | None:
     """Return the drone's path, or None if it is unknown.
 
-    Uses the vehicle's position if there is one, otherwise the simulator's true one, otherwise the integrated velocity.
+    Uses the vehicle's own position or, failing that, the simulator's true one or the integrated velocity.
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (

@@ -28,7 +28,7 @@ MIN_STEPS: Final = 5  #: with fewer steps, the typical step is unknown
 class Delay:
     """Statistics on the time between two timestamps of a sample [s]."""
 
-    what: str  #: the two timestamps, in words
+    what: str  #: names of the two timestamps
     median_s: float
     p99_s: float
 
@@ -41,9 +41,9 @@ class Row:
     schema: str
     count: int
     rate_hz: float | None  #: None if there is only one message, or if all have the same time
-    gaps: int  #: steps longer than three typical ones; counted in steady channels only
+    gaps: int  #: number of steps longer than three typical ones, in steady channels only
     longest_s: float | None  #: longest step between two messages [s]
-    missing: int  #: messages missing according to gaps in the samples' own numbers
+    missing: int  #: messages missing according to gaps in the samples' sequence numbers
     bytes: int
     steady: bool  #: whether messages arrive at a steady rate, so that rate and gaps are meaningful
     delays: tuple[Delay, ...] = ()
@@ -58,7 +58,7 @@ class Summary:
     dropped: dict[str, dict[str, int]]  #: samples dropped by the recorder, by drone and channel
     missed: dict[str, dict[str, int]]  #: samples that never reached the recorder, by drone and channel
     events: dict[str, int]  #: number of events by severity
-    notes: tuple[str, ...] = ()  #: problems with the file, in words
+    notes: tuple[str, ...] = ()  #: descriptions of problems with the file
 
 
 @dataclass(slots=True)

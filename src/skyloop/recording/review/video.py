@@ -25,7 +25,7 @@ from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
 _TIME_BASE: Final = Fraction(1, 60_000)  #: each image keeps its own timestamp; MPEG-4 allows at most 65535
-_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: by preference; the first one in this PyAV build is used
+_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: by preference; the first that PyAV has is used
 
 
 @dataclass(frozen=True, slots=True)

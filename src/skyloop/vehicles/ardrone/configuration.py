@@ -73,7 +73,7 @@ class Configurator:
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}  #: the configuration as last read
-        self.ids: Ids | None = None  #: ids sent before each CONFIG
+        self.ids: Ids | None = None  #: ids to send before each CONFIG
         self.wants_dump = 0  #: number of the dump for which a connection to the control port is needed; 0 if none is
         self.trouble = ""  #: why the last dump failed
         self._queue: deque[Exchange] = deque()

@@ -39,7 +39,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back; return the failure or None. Takes up to 0.9 s; not for the link's thread."""
+        """Write a key and read it back, within 0.9 s; return the failure or None. Not for the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)

@@ -28,7 +28,7 @@ KNOWN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class ArdroneOptions:
-    """A parsed address."""
+    """The contents of a parsed ``ardrone://`` address."""
 
     host: str
     ports: Ports = navdata.STANDARD
@@ -44,7 +44,7 @@ def options_of(uri: VehicleUri) -> ArdroneOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")
+        raise UsageError(f"{uri} names no host; it should look like ardrone://192.168.1.1")
     if not _HOST.match(uri.place):
         hint = "; ports are given as options, such as ?at_port=5556" if ":" in uri.place else ""
         raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")

@@ -62,7 +62,7 @@ LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is LOST
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
 SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
-SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: then the link is DEGRADED and the drone may fly without set-up
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after this the link is DEGRADED and the drone may fly without set-up
 DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone is ignoring our commands
 REPEATS: Final = 3  #: how many times an unacknowledged command is sent
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
@@ -171,7 +171,7 @@ class ArdroneSession(VehicleSession):
     def _detect_break(self, state: State, now_ns: int) -> None:
         """Detect that the drone restarted or lost us, even during a silence too short to count as a lost link.
 
-        The drone may have lost its set-up in the process. Two consecutive datagrams must show it.
+        The drone may have lost its set-up in the process. Two consecutive datagrams must show the change.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state

@@ -1,4 +1,4 @@
-"""Turning set-points into ``REF`` and ``PCMD``, tick by tick. Pure.
+"""Convert set-points to ``REF`` and ``PCMD``, tick by tick. Pure.
 
 ``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
 emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps it
@@ -105,7 +105,7 @@ def _share(value: float, limit: float) -> float:
     return clamped(value / limit, 1.0) + 0.0  # avoids a negative zero
 
 
-TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not taken off by then is refusing to
+TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone not in the air after this long is refusing to take off
 RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time of sending a take-off is ours, not another program's
 #: Navdata shows the effect of the emergency bit within this time, on both ends' clocks.
 TOGGLE_NS: Final = nanoseconds(0.5)
@@ -161,7 +161,7 @@ class SetpointController:
     """
 
     def __init__(self) -> None:
-        self.condition: Condition | None = None  #: as shown by the newest navdata; None while the drone is silent
+        self.condition: Condition | None = None  #: according to the newest navdata; None while the drone is silent
         self.limits: StickLimits | None = None  #: None until they have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
@@ -170,10 +170,10 @@ class SetpointController:
         self._landing_is_ours = False
         self._decided_ns = 0
         self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
-        self._releasing = False  # whether a reset was requested and navdata does not show it yet
+        self._releasing = False  # whether a reset was requested that does not show in navdata yet
         self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
-        self._bit_due = False  # whether to set the bit next, whatever navdata shows
+        self._bit_due = False  # whether to set the bit next, regardless of navdata
         self._changed_ns = 0  # time of the last change of or request for the bit, or of the end of an emergency
         self._passed_ns = 0  # the drone's own time from then until the newest navdata
         self._received_ns = 0
@@ -277,8 +277,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. It
-        distinguishes delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. This tells
+        delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns

@@ -143,7 +143,7 @@ CONNECT_S: Final = 1.0  #: connection timeout
 POLL_S: Final = 0.1  #: longest time that a read waits
 SILENT_S: Final = 3.0  #: the connection is closed if no complete frame arrives for this long
 KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
-WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1; any small datagram starts the video and keeps it running
+WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1: any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
 
 
@@ -225,12 +225,12 @@ def open_stream(version: int, host: str, port: int, connection: int, clock: Cloc
 
 def _give_up_if_silent(silent_ns: int) -> None:
     if silent_ns > nanoseconds(SILENT_S):
-        raise TimeoutError(f"no frame came for {SILENT_S:g} s")
+        raise TimeoutError(f"no frame arrived for {SILENT_S:g} s")
 
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: a number further back than this means that the drone restarted, not that the image is late
+REORDERED: Final = 64  #: a number lower by more than this means that the drone restarted, not that the image is late
 OLD_RUN: Final = 4  #: this many consecutive images older than the newest also mean that the drone restarted
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
@@ -375,7 +375,7 @@ class VideoReceiver(LiveVideo):
         clock: Clock = monotonic_ns,
     ) -> None:
         if version not in (1, 2):
-            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
+            raise UsageError(f"the AR.Drone's version must be 1 or 2, got {version}")
 
         super().__init__(
             f"{host}:{port}",

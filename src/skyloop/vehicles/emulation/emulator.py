@@ -109,7 +109,7 @@ class Loop:
             _log.exception("the emulated firmware raised an error and continues")
 
     def _wake(self) -> None:
-        with suppress(OSError):  # a full pipe: the loop is already awake
+        with suppress(OSError):  # the pipe is full, so the loop is already awake
             self._waker.send(b"\0")
 
     def _empty(self) -> None:
@@ -372,7 +372,7 @@ class Emulator(ABC, Generic[R]):
     def start(self) -> None:
         """Switch the firmware on. Everything except its ports is reset."""
         if self._running is not None:
-            raise UsageError("this firmware is started already")
+            raise UsageError("this firmware is already running")
         self._running = self._switched_on()
 
     def stop(self) -> None:
@@ -404,5 +404,5 @@ class Emulator(ABC, Generic[R]):
 def checked_delay(delay_s: float) -> float:
     """Return the delay [s]; raise :class:`UsageError` unless it is from 0 to :data:`LONGEST_DELAY_S`."""
     if not 0 <= delay_s <= LONGEST_DELAY_S:
-        raise UsageError(f"a delay is from 0 to {LONGEST_DELAY_S:g} s, not {delay_s!r}")
+        raise UsageError(f"delay_s must be from 0 to {LONGEST_DELAY_S:g} s, got {delay_s!r}")
     return delay_s

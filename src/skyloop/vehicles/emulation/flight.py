@@ -117,7 +117,7 @@ class FlightControl:
 
     @property
     def highest_m(self) -> float:
-        """The greatest height that the vehicle can reach; a climb to a greater one would never end."""
+        """The greatest height that the vehicle can reach; a climb beyond it would never end."""
         return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
 
     @property
@@ -186,7 +186,7 @@ class FlightControl:
         self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
 
     def level_thrust(self) -> None:
-        """Start flying by thrust from the present climb rate."""
+        """Start flying by thrust with the current climb rate."""
         self._sinking = self.velocity[2]
 
     def yaw_rate_to(self, yaw: float) -> float:
@@ -197,6 +197,6 @@ class FlightControl:
         if not action.finite:
             action = Hover()  # ignore numbers that are not finite
         if self.vehicle.state is FlightState.LANDING:
-            self.lift_off()  # how the vehicle aborts a landing
+            self.lift_off()  # this makes the vehicle abort a landing
         if self.airborne:
             self.vehicle.command(action)

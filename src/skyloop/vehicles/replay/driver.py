@@ -158,7 +158,7 @@ def options_of(uri: VehicleUri) -> ReplayOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")
+        raise UsageError(f"{uri} names no file; it should look like replay:///home/me/flight.mcap?speed=2")
     stepped = uri.options.get("speed") == MAX
     options = ReplayOptions(
         path=expand(uri.reveal_place()),

@@ -17,10 +17,10 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.plain import Course, shifted
 from skyloop.recording.reader import Item, Recording
 
-#: Channels that are replayed. Annotations and logs are not: applications create new ones.
+#: Channels that are replayed. Annotations and logs are not replayed, because applications create new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
-_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance equally within this tolerance were not reset
+_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance equally to within this tolerance were not reset
 Sample = Feedback | Picture | Event | Applied | Parameter
 
 
@@ -52,7 +52,7 @@ class Moment:
 #: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
 #: has an image. A camera that was silent for longer shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
-_KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
+_KEPT_STATES: Final = 500  #: states to keep from before the time sought, to find the one that matches the images
 
 
 class ReplaySource:
@@ -193,7 +193,7 @@ _NEVER_NS: Final = 1 << 63
 
 
 def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
-    """Return the state at the capture of the newest image, so that the two match."""
+    """Return the state when the newest image was captured, so that state and image match."""
     if not states:
         return None
     newest_ns = max(state.captured_ns for state in states)

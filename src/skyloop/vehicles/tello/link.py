@@ -69,7 +69,7 @@ class TelloLink(VehicleLink[TelloSession]):
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
     ) -> None:
         super().__init__("skyloop-tello", session, deliver, clock)
-        self.addresses: tuple[str, str] | None = None  #: the drone's address, and this host's on the route to it
+        self.addresses: tuple[str, str] | None = None  #: addresses of the drone, and of this host on the route to it
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
 

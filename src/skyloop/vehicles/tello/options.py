@@ -57,7 +57,7 @@ def options_of(uri: VehicleUri) -> TelloOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")
+        raise UsageError(f"{uri} names no host; it should look like tello://192.168.10.1")
     if not _HOST.match(uri.place):
         hint = "; the port is given as an option: ?port=8889" if ":" in uri.place else ""
         raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")

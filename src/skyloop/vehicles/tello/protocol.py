@@ -126,7 +126,7 @@ TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
 DEGRADED_NS: Final = nanoseconds(0.6)  #: silence after which the link is DEGRADED; state arrives ten times per second
 LOST_NS: Final = nanoseconds(1.5)  #: silence after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing within this time is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
 ALONE_NS: Final = nanoseconds(30.0)  #: a drone without commands has landed by then, having begun after 15 s
@@ -166,7 +166,7 @@ class TelloSession(VehicleSession):
         self.sdk: Sdk | None = None  #: None until there is a reply to ``sdk?``; SDK 1.3 replies with an error
         self.serial = ""
         self.ready = False  #: whether state arrives and commands are answered
-        self.remembered: dict[str, str] = {}  #: the command that last set each parameter, for a link loss
+        self.remembered: dict[str, str] = {}  #: last command for each parameter, to be resent after a link loss
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()

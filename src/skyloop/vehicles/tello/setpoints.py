@@ -1,6 +1,6 @@
-"""Turning set-points into sticks and motions. The last action is kept until the state shows that it is done. Pure.
+"""Convert set-points to sticks and motions. The last action is kept until the state shows that it is done. Pure.
 
-Replies are not relied on: they arrive seconds late or not at all. A take-off or landing is repeated until it shows.
+It does not rely on replies, which arrive seconds late or not at all. A take-off or landing is repeated until it shows.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FULL_TILT_RAD: Final = 0.2  #: attitude that a full stick stands for; chosen to 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A number for each stick: the effect of a full stick, or the largest set-point."""
+    """One number per stick axis: the effect of a full stick, or the largest set-point."""
 
     speed: float = FULL_SPEED_M_S  #: [m/s]
     climb: float = FULL_CLIMB_M_S  #: [m/s]
@@ -84,8 +84,8 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
-AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show by then is repeated
-TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not taken off by then is refusing to
+AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that has no visible effect within this time is repeated
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone not in the air after this long is refusing to take off
 RISES_NS: Final = nanoseconds(3.0)  #: a take-off may start until this long after it was sent; real drones take 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
@@ -117,7 +117,7 @@ class SetpointController:
         self._stick = LEVEL
         self._decided_ns = 0
         self._sent_ns: int | None = None  # when the take-off or landing was sent
-        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
+        self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._state_ns = 0  # when the last state arrived
         self._was_in_air = False  # according to the last state, or because we have just sent a take-off
         self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
@@ -256,7 +256,7 @@ class SetpointController:
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the reply to a take-off or landing. For an emergency stop, only the motors' state counts."""
+        """Handle the reply to a take-off or landing. For an emergency stop, only the state of the motors matters."""
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused

@@ -83,7 +83,7 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
-POLL_S: Final = 0.1  #: longest time that a read waits
+POLL_S: Final = 0.1  #: maximum time that a read blocks
 SILENT_S: Final = 3.0  #: the port is reopened if no datagram arrives for this long
 BURST: Final = 64  #: maximum number of datagrams per read
 
@@ -180,7 +180,7 @@ class TelloVideo:
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         unit = coded.data
         if not isinstance(unit, AccessUnit):
-            raise TypeError("expected a picture of a Tello")
+            raise TypeError("expected an image from a Tello")
         came, self._came = self._came, unit.number
         left_out = came is not None and unit.number != came + 1
         if unit.is_key:

@@ -4,7 +4,7 @@ Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". What SDK 3.0 (Tel
 adds is known from the commands that djitellopy sends.
 
 A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
-only if it has the form of that command's replies.
+only if it has the format of that command's replies.
 
 State arrives ten times per second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
 positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm this for both
@@ -34,7 +34,7 @@ SILENCE_S: Final = 15.0  #: the Tello lands after this time without a command
 
 ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100
-#: Effect of a stick of 100. An estimate: no guide specifies it; users take ``rc`` to be in cm/s and degrees per second.
+#: Effect of a stick at 100; an estimate, because no guide gives it. Users take ``rc`` to be in cm/s and degrees/s.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
@@ -129,7 +129,7 @@ def is_error(reply: str) -> bool:
 
 
 def answers(reply: str, command: str) -> bool:
-    """Return whether this reply can belong to this command, being an error or of the right form."""
+    """Return whether a reply can belong to a command: it is an error or has the right format."""
     if reply.lower().startswith("unknown command"):
         named = reply.partition(":")[2].strip()
         return named in ("", command)
@@ -140,7 +140,7 @@ MAX_STATE: Final = 1024
 FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
 GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, which is its minimum
-NO_PAD: Final = -1  #: pad number if none is in view (-2 if detection is off)
+NO_PAD: Final = -1  #: pad number while none is in view (-2 if detection is off)
 NOWHERE_CM: Final = -100  #: value of each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
 
@@ -182,7 +182,7 @@ def parse(datagram: bytes) -> State:
     The last field of a truncated string is dropped, unless its semicolon is present.
     """
     if len(datagram) > MAX_STATE:
-        raise DecodeError(f"a state string of {len(datagram)} bytes; the Tello's have less than {MAX_STATE}")
+        raise DecodeError(f"the state string has {len(datagram)} bytes; a Tello's has at most {MAX_STATE}")
     try:
         text = datagram.decode("ascii")
     except UnicodeDecodeError:
@@ -198,7 +198,7 @@ def parse(datagram: bytes) -> State:
         elif len(numbers) == 3 and all(map(math.isfinite, numbers)):
             fields[match[1]] = (numbers[0], numbers[1], numbers[2])
     if not fields:
-        raise DecodeError(f"no field of a state string in {datagram[:40]!r}")
+        raise DecodeError(f"no state field in {datagram[:40]!r}")
     return _state(fields)
 
 

@@ -55,7 +55,7 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. To learn a file's image size its head is read once; a live camera is not opened."""
+        """Return the camera. A file's head is read once to determine its image size; a live camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
@@ -133,7 +133,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams, which consists only of its counters because nothing is flying."""
+        """Publish feedback while the camera streams. It consists only of counters, because nothing is flying."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))
@@ -229,8 +229,8 @@ def options_of(uri: VehicleUri) -> VideoOptions:
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(
-            f"{uri} names no file and no camera: it looks like video:///home/me/flight.mp4, video:///dev/video0 or "
-            f"video://rtsp://192.168.1.10/live; {described(cameras())}"
+            f"{uri} names neither a file nor a camera; it should look like video:///home/me/flight.mp4, "
+            f"video:///dev/video0 or video://rtsp://192.168.1.10/live; {described(cameras())}"
         )
     path, source = _place(uri)
     _check_kind(uri, source)

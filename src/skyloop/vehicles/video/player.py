@@ -79,7 +79,7 @@ class ContainerSource:
     def __init__(self, name: str) -> None:
         self._name = name
         self.damaged = 0  #: number of pieces so far that could not be decoded
-        self.stream = ""  #: ``h264`` if images with this codec can be relayed unchanged, otherwise empty
+        self.stream = ""  #: ``h264`` if images in this codec can be relayed unchanged, otherwise empty
         try:
             self._container: InputContainer = av.open(name)
         except (FFmpegError, OSError, ValueError) as error:
@@ -162,7 +162,7 @@ class PaveSource:
         first = next(iter(self._parser_frames()), None)
         if first is None:
             self._file.close()
-            raise FileFormatError(f"{path} holds no frame of a PaVE stream")
+            raise FileFormatError(f"{path} contains no PaVE frame")
         self._file.seek(0)
         self._parser = PaveParser()
         self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS

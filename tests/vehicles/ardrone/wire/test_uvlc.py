@@ -313,12 +313,12 @@ def test_steps_grow_with_the_quantiser_and_the_frequency(quality: int) -> None:
     [
         (run(62) + level(1) + run(0) + level(1), "a coefficient 64; 63 is the last"),
         (run(40) + level(1) + run(40) + level(1), "a coefficient 82"),
-        (run(64) + level(1), "7 zeros do not begin a code of a run"),
-        ("0" * 16, "zeros do not begin a code of a run"),
-        (run(3) + "01", "1 zeros do not begin a code of a level after a run of 3"),
+        (run(64) + level(1), "7 zeros cannot begin a run's code"),
+        ("0" * 16, "zeros cannot begin a run's code"),
+        (run(3) + "01", "1 zeros cannot begin a level's code after a run of 3"),
         (run(0) + "0" * 12 + "1" * 13, "12 zeros do not begin a code of a level"),
-        (run(0) + level(206), "greater than in any picture"),
-        (run(13) + level(-115), "greater than in any picture"),
+        (run(0) + level(206), "exceeds the range of a valid picture"),
+        (run(13) + level(-115), "exceeds the range of a valid picture"),
     ],
 )
 def test_impossible_coefficients(pairs: str, match: str) -> None:
@@ -327,7 +327,7 @@ def test_impossible_coefficients(pairs: str, match: str) -> None:
 
 
 def test_an_impossible_mean() -> None:
-    with pytest.raises(DecodeError, match="greater than in any picture"):
+    with pytest.raises(DecodeError, match="exceeds the range of a valid picture"):
         decode(with_first(macroblock([GREY] * 5 + [685])))
 
 
@@ -425,14 +425,14 @@ def test_a_p_picture_needs_its_predecessor(number: int) -> None:
 
 
 def test_a_stream_cannot_start_with_a_p_picture() -> None:
-    with pytest.raises(DecodeError, match="changes a picture that never arrived"):
+    with pytest.raises(DecodeError, match="updates a picture that never arrived"):
         decode(changes(6))
 
 
 def test_a_p_picture_has_the_size_of_its_predecessor() -> None:
     decoder = UvlcDecoder()
     decoder.decode(packet(large_picture(2, 1, header(form=2, resolution=1))))
-    with pytest.raises(DecodeError, match="of 80x64 changes one of 160x112"):
+    with pytest.raises(DecodeError, match="of 80x64 updates one of 160x112"):
         decoder.decode(packet(changes(6)))
 
 

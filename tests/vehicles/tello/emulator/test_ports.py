@@ -134,8 +134,8 @@ def test_a_free_port_is_kept_after_a_restart() -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"sdk": "4.0"}, "there is SDK 1.3, 2.0, 3.0 of the Tello"),
-        ({"delay_s": 11.0}, "a delay is from 0 to 10 s"),
+        ({"sdk": "4.0"}, "sdk must be one of 1.3, 2.0, 3.0"),
+        ({"delay_s": 11.0}, "delay_s must be from 0 to 10 s"),
         ({"pads": {9: (0.0, 0.0)}}, "mission pads are numbered from 1 to 8"),
     ],
 )

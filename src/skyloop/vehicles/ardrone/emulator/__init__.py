@@ -112,7 +112,7 @@ class Listeners:
 
 
 MOST_CLIENTS: Final = 8  #: maximum number of clients of a TCP port
-MOST_BACKLOG: Final = 256 * 1024  #: bytes queued for one client in addition to the system's buffer
+MOST_BACKLOG: Final = 256 * 1024  #: maximum number of bytes queued for one client in addition to the system's buffer
 _SYSTEM_BUFFER: Final = 64 * 1024
 _READ: Final = 4096
 
@@ -139,7 +139,7 @@ class Outlet:
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece unless the client is too slow; ``starts`` says whether a stream can begin with it."""
+        """Send a piece unless the client is too slow. ``starts``: whether a stream can begin with this piece."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:
@@ -190,7 +190,7 @@ class Outlet:
 
 
 class StreamPort:
-    """A TCP port that sends to its clients and discards what they send. Used on the loop's thread."""
+    """A TCP port that sends to its clients and discards what they send. Use only on the loop's thread."""
 
     def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
         self._loop = loop
@@ -209,7 +209,7 @@ class StreamPort:
         while True:
             try:
                 connection, _ = self._socket.accept()
-            except OSError:  # none pending, or already closed
+            except OSError:  # no connection is pending, or the socket is already closed
                 return
             if len(self.outlets) >= MOST_CLIENTS:
                 connection.close()
@@ -450,7 +450,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         torn_start: bool = True,
     ) -> None:
         if version not in VERSIONS:
-            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, but no version {version!r}")
+            raise UsageError(f"the AR.Drone's version must be 1 or 2, got {version!r}")
         if header_size not in (64, 68):
             raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
         if version > 1:
@@ -460,7 +460,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports for a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports the same after a restart
         return running
 
     @property

@@ -1,4 +1,4 @@
-"""The firmware's flight logic: turns AT commands, silence and battery state into set-points. Pure: no clock.
+"""The firmware's flight logic: turns AT commands, gaps in them and the battery state into set-points. Pure: no clock.
 
 The decisions are those described in the Developer Guide. Flight animations are not modelled: a request is stored and
 navdata reports a flip for its duration, but the vehicle continues to follow its last command.
@@ -26,7 +26,7 @@ from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
 TAKEOFF_ALTITUDE_M: Final = 0.85  #: real drones hover at 0.7 to 1 m after a take-off
-_LEAST_TURNING_SPEED_M_S: Final = 1.0  # a coordinated turn at a lower speed is computed for this one
+_LEAST_TURNING_SPEED_M_S: Final = 1.0  # minimum speed with which to compute a coordinated turn
 _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
 
@@ -92,10 +92,10 @@ def _possible(name: str, value: float) -> float:
 
 
 HOVER_AFTER_S: Final = 0.25  #: silence before it hovers: general:com_watchdog in the Developer Guide (not checked)
-LOST_AFTER_S: Final = 2.0  #: silence before the link counts as lost
-CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, as no source gives the angle
+LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
+CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
 BATTERY_RECOVERY_MV: Final = 500  #: how far above vbat_min a battery no longer counts as low; an estimate
-CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate of the calibration's turn, which takes about 4 s; an estimate
+CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn in about 4 s; an estimate
 FIRST_FLIP: Final = 16
 LAST_ANIMATION: Final = 19
 

@@ -107,7 +107,7 @@ class ArdroneLogic:
         self._watchdog = True
         self._ack = False
         self.lost = False  #: whether the link counts as lost after a long silence
-        self._ids: Ids | None = None  # ids from the immediately preceding command
+        self._ids: Ids | None = None  # ids received with the previous command
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
         self.bootstrap = True  #: whether the drone sends no options yet, until its mode is configured
@@ -171,7 +171,7 @@ class ArdroneLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits; ``video`` says whether any client is receiving video."""
+        """Return the state bits. ``video``: whether any client is receiving video."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,

@@ -88,7 +88,7 @@ class ControlState(IntEnum):
 
 Floats: TypeAlias = tuple[float, ...]
 Ints: TypeAlias = tuple[int, ...]
-Option: TypeAlias = Any  #: a named tuple, one of those below
+Option: TypeAlias = Any  #: one of the named tuples below
 
 
 class Layout:
@@ -135,7 +135,7 @@ _Kind = TypeVar("_Kind", bound=type[Any])
 
 
 def _option(tag: int, form: str) -> Callable[[_Kind], _Kind]:
-    """Register an option whose fields the driver reads: a class, so that their types are checked."""
+    """Register a class for an option whose fields the driver reads. Using a class lets their types be checked."""
 
     def register(kind: _Kind) -> _Kind:
         layout = Layout(tag, kind, form.split())
@@ -288,7 +288,7 @@ class VisionDetect(NamedTuple):
 
 #: The control loop's watchdog.
 Watchdog = _declared(17, "Watchdog", "i watchdog")
-#: A frame of the acquisition board.
+#: A frame from the acquisition board.
 AdcDataFrame = _declared(18, "AdcDataFrame", "I version; 32B data")
 #: The state of the video encoder.
 VideoStream = _declared(

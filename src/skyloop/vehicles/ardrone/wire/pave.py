@@ -54,7 +54,7 @@ class PaveFrame:
     type: int  #: one of :class:`FrameType`, or another number
     number: int  #: the drone's frame count
     timestamp_ms: int  #: time on the drone's own clock
-    width: int  #: width of the image to show [px]
+    width: int  #: width of the displayed image [px]
     height: int
     stream_id: int
     payload: bytes
@@ -70,7 +70,7 @@ class PaveFrame:
 class _Header:
     size: int
     payload_size: int
-    frame: PaveFrame  #: still without its payload
+    frame: PaveFrame  #: the frame, whose payload is still empty
 
 
 def build_header(

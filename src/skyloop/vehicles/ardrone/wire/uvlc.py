@@ -1,4 +1,4 @@
-"""UVLC, the Parrot AR.Drone 1's video codec: a datagram in, a picture out. Pure; NumPy only.
+"""UVLC, the video codec of the Parrot AR.Drone 1: turns one datagram into one image. Pure; NumPy only.
 
 The drone sends one picture per datagram from its UDP port 5555, without an additional header. A picture consists of
 16-line groups of 16x16 macroblocks (4:2:0), made of 8x8 cosine-transformed blocks. Each block is a 10-bit mean, then
@@ -10,7 +10,7 @@ run and level codes (see below). No recording of this video is public; the sourc
   pictures with them: the order of the coefficients, and the steps for quantiser 31; the latter also prints the first 12
   bytes of a picture.
 
-Where they disagree, this module follows whatever worked with real drones:
+Where they disagree, this module does what is known to work with real drones:
 
 * If a macroblock's first bit is set, it is *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
 * Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if the quantiser is 31 ("the old
@@ -23,8 +23,8 @@ Where they disagree, this module follows whatever worked with real drones:
   group; at 31 it is read and ignored, as in python-ardrone.
 * Macroblocks that would be partly outside the picture are not coded (Parrot SDK): for 88x72, 80x64 is coded, and for
   160x120, 160x112.
-* P pictures have never been seen. As in the Parrot SDK, their coded macroblocks are complete in themselves. The others
-  repeat the previous picture, whose number must be one less, as in H.263, which the guide names as the codec's origin.
+* P pictures have never been seen. Their coded macroblocks are complete in themselves (Parrot SDK). As in H.263, from
+  which the guide derives the codec, the others repeat the previous picture, whose number must be one lower.
 
 There is no checksum, so a damaged packet can pass for a picture. The decoder checks everything that the format allows.
 
@@ -92,7 +92,7 @@ MAX_RUN_ZEROS: Final = 6  #: number of leading zeros in the longest code for a r
 class PictureType(IntEnum):
     """Values of the header's picture type."""
 
-    INTRA = 0  #: complete in itself
+    INTRA = 0  #: can be decoded without any other picture
     INTER = 1  #: uncoded macroblocks repeat the previous picture
 
 
@@ -143,7 +143,7 @@ INVERSE_TRANSFORM: Final = _inverse_transform()
 
 WINDOW: Final = 16  #: bits per table lookup
 PADDING: Final = 32  #: zero bytes appended to the packet, so that no lookup goes past the end
-_PAIRS: Final = 5  #: maximum number of whole pairs in a window, as the shortest takes 3 bits
+_PAIRS: Final = 5  #: maximum number of whole pairs in a window; the shortest pair takes 3 bits
 _MAX_LEVEL_ZEROS: Final = 11  #: allows levels below 2048; pictures of 8-bit samples have none greater
 
 Ints = NDArray[np.int64]
@@ -219,7 +219,7 @@ class BlockWalker:
         self.window = windows.data  #: the windows as a memory view, which is faster for single lookups
         self._steps = self._table.step[windows].data
         self._visits: list[int] = []  # positions of the windows with whole pairs, and of the long pairs [bits]
-        self._ends: list[int] = []  # number of visits at the end of each block
+        self._ends: list[int] = []  # number of entries in ``_visits`` at the end of each block
         self._long: list[tuple[int, int, int]] = []  # for each pair longer than a window: visit, run + 1 and level
 
     def walk(self, at: int) -> int:
@@ -243,10 +243,10 @@ class BlockWalker:
         """Read one pair that is invalid or does not fit in a window; return the position of the bit after it."""
         zeros, run, at = self._read_value(at)
         if zeros > MAX_RUN_ZEROS:
-            raise DecodeError(f"{zeros} zeros do not begin a code of a run")
+            raise DecodeError(f"{zeros} zeros cannot begin a run's code")
         zeros, level, at = self._read_value(at)
         if zeros == 1 or zeros > _MAX_LEVEL_ZEROS:
-            raise DecodeError(f"{zeros} zeros do not begin a code of a level after a run of {run}")
+            raise DecodeError(f"{zeros} zeros cannot begin a level's code after a run of {run}")
         level = max(level, 1)
         negative = self.window[at] >> (WINDOW - 1)
         self._long.append((len(self._visits) - 1, run + 1, -level if negative else level))
@@ -312,7 +312,7 @@ class UvlcHeader:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UvlcPicture(UvlcHeader):
-    """One picture from the drone's camera."""
+    """One image from the drone's camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
 
@@ -323,7 +323,7 @@ def is_p264(packet: bytes | bytearray | memoryview) -> bool:
 
 
 def is_intra(packet: bytes | bytearray | memoryview) -> bool:
-    """Return whether a datagram begins like a picture that is complete in itself."""
+    """Return whether a datagram starts with the header of an intra picture, which needs no other picture."""
     head = int.from_bytes(bytes(packet[:4]), "little")
     kind = head >> (32 - START_CODE_BITS - FORMAT_BITS - RESOLUTION_BITS - TYPE_BITS) & (1 << TYPE_BITS) - 1
     return head >> (32 - START_CODE_BITS) == UVLC_START and kind == PictureType.INTRA
@@ -355,13 +355,13 @@ class UvlcDecoder:
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
-            raise DecodeError(f"picture {header.number} changes a picture that never arrived")
+            raise DecodeError(f"picture {header.number} updates a picture that never arrived")
         last, samples = self._last
         if header.number != last.number + 1 & 0xFFFFFFFF:
-            raise DecodeError(f"picture {header.number} changes the one before it, but {last.number} was the last")
+            raise DecodeError(f"picture {header.number} updates the one before it, but {last.number} was the last")
         if (header.width, header.height) != (last.width, last.height):
             raise DecodeError(
-                f"picture {header.number} of {header.width}x{header.height} changes one of {last.width}x{last.height}"
+                f"picture {header.number} of {header.width}x{header.height} updates one of {last.width}x{last.height}"
             )
         return samples
 
@@ -387,13 +387,13 @@ class _Reader:
         if code == P264_START:
             raise DecodeError("a picture of P264, which is not supported: set video:video_codec to UVLC (0x20)")
         if code != UVLC_START:
-            raise DecodeError(f"a picture of UVLC begins with {UVLC_START:#08x}, this with {code:#08x}")
+            raise DecodeError(f"a UVLC picture must begin with {UVLC_START:#08x}, got {code:#08x}")
         form, resolution = self._read(FORMAT_BITS), self._read(RESOLUTION_BITS)
         if (form, resolution) not in SIZES:
-            raise DecodeError(f"there is no picture of format {form} and resolution {resolution}")
+            raise DecodeError(f"no picture has format {form} and resolution {resolution}")
         kind = self._read(TYPE_BITS)
         if kind not in (PictureType.INTRA, PictureType.INTER):
-            raise DecodeError(f"there is no picture of type {kind}")
+            raise DecodeError(f"unknown picture type {kind}")
         quant = self._read_quant()
         width, height = (side - side % MACROBLOCK for side in SIZES[form, resolution])
         return UvlcHeader(self._read(NUMBER_BITS), PictureType(kind), quant, width, height)
@@ -488,7 +488,7 @@ class _Reader:
         limits = np.full(COEFFICIENTS, _MAX_AC, np.float32)
         limits[0] = _MAX_DC
         if (np.abs(coefficients) > limits + steps / 2).any():
-            raise DecodeError("a coefficient is greater than in any picture")
+            raise DecodeError("a coefficient exceeds the range of a valid picture")
         values = coefficients @ INVERSE_TRANSFORM
         np.clip(np.rint(values, out=values), 0, 255, out=values)
         samples[coded] = values.astype(np.uint8).reshape(-1, BLOCKS, COEFFICIENTS)

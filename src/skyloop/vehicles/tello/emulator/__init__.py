@@ -62,7 +62,7 @@ TELLO: Final = VehicleParameters(
     half_height_m=0.02,
     rotor_radius_m=0.038,
     rotor_height_m=0.03,
-    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s from leaving the ground to hovering, in a recorded flight
+    takeoff_climb_m_s=0.7,  # from a recorded flight: 0.8 m in the 1.3 s between leaving the ground and hovering
     battery_full_v=4.35,
     battery_empty_v=3.3,
     battery_charge_c=3960.0,  # 1100 mAh
@@ -75,7 +75,7 @@ LIMITS: Final = Limits(
     climb_m_s=FULL_CLIMB_M_S,
     yaw_rate_rad_s=FULL_YAW_RATE_RAD_S,
     altitude_m=10.0,
-    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # with the stick in a corner
+    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # the speed with a stick in a corner
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
@@ -92,7 +92,7 @@ FRONT: Final = replace(
     distortion=(-0.033458, 0.105152, 0.001256, -0.006647, 0.0),
     position_m=(0.05, 0.0, 0.0),
 )
-BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: the lens is an estimate
+BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: the lens parameters are an estimate
 
 
 def with_tellos(options: SimOptions | None = None) -> SimOptions:
@@ -132,7 +132,7 @@ class TelloPacker:
         self.size = (FRONT.width, FRONT.height)
 
     def pack(self, picture: NDArray[np.uint8], settings: OneCamera, _captured_ns: int) -> Piece | None:
-        """Encode an image; None if the encoder returned nothing."""
+        """Encode an image; return None if the encoder produced no output."""
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -274,7 +274,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
         pads: Mapping[int, tuple[float, float]] | None = None,
     ) -> None:
         if sdk not in list(Sdk):
-            raise UsageError(f"there is SDK {', '.join(Sdk)} of the Tello, not {sdk!r}")
+            raise UsageError(f"sdk must be one of {', '.join(Sdk)}, got {sdk!r}")
         for number in pads or {}:
             if not 1 <= number <= MOST:
                 raise UsageError(f"mission pads are numbered from 1 to {MOST}, not {number!r}")
@@ -284,7 +284,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, port=running.port)  # keeps the port for a restart
+        self.settings = replace(self.settings, port=running.port)  # keeps the port the same after a restart
         return running
 
     @property
@@ -294,5 +294,5 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     @property
     def logic(self) -> TelloLogic:
-        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Use it only on the loop's thread."""
         return self._started.logic

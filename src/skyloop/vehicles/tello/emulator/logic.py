@@ -48,7 +48,7 @@ _SLOW_M_S: Final = 0.12  # … and below this speed
 _NEAR_RAD: Final = 0.03  # a turn ends within this angle
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
-#: The vehicle's next command, and the reply if the command that takes time is over.
+#: The vehicle's next command, and the reply if the command that was running is over.
 Step = tuple[AnyAction | None, str | None]
 
 
@@ -143,7 +143,7 @@ Range = tuple[int, int]
 _MOVE: Final[tuple[Range, ...]] = ((20, 500),)
 _SPEED: Final[Range] = (10, 100)
 _PLACE: Final[tuple[Range, ...]] = ((-500, 500),) * 3
-_LEAST_CM: Final = 20  # at least one coordinate of a position must have this magnitude
+_LEAST_CM: Final = 20  # at least one coordinate of a target must have this magnitude
 
 MOVES: Final = {
     "up": (0, 0, 1),
@@ -221,7 +221,7 @@ class TelloLogic:
         self._job: tuple[Job, Address | None] | None = None  # the running job, with the recipient of its reply
         self._received_ns = clock()
         self._speed_cm_s = USUAL_SPEED_CM_S
-        self._start: tuple[float, float] | None = None  # yaw at switch-on, altitude at take-off
+        self._start: tuple[float, float] | None = None  # yaw when switched on, altitude at take-off
         self._motor_s = 0.0
         self._before_s: float | None = None
         self.client: str | None = None  #: the recipient of state and video; None before ``command``
@@ -232,7 +232,7 @@ class TelloLogic:
         self.looks_for_pads = False
         self.fps = FPS["high"]
         self.size = SIZES["high"]
-        self.bitrate_mbps = 0  #: 0 to adapt to the link
+        self.bitrate_mbps = 0  #: 0 means that it adapts to the link
         self.unknown = 0  #: number of datagrams that were not commands
 
     # Receiving -------------------------------------------------------------------------------------------------
@@ -251,7 +251,7 @@ class TelloLogic:
             self._answer(reply, sender)
 
     def supervise(self, report: Report) -> None:
-        """Handle the vehicle's newest report and continue the present command. Called regularly."""
+        """Handle the vehicle's newest report and continue the current command. Called regularly."""
         truth = report.truth
         if self._start is None:
             self._start = report.believed.yaw_rad, report.believed.altitude_m
@@ -296,7 +296,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the reply, or None if there is none or it comes later."""
+        """Execute a command. Return the reply, or None if there is none yet or none will come."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"
@@ -341,7 +341,7 @@ class TelloLogic:
             self.bitrate_mbps = numbers[0]
         elif name == "downvision":
             self.looks_down = bool(numbers[0])
-        return OK  # mdirection: pads are seen whatever it is
+        return OK  # ``mdirection`` has no effect: pads are seen in any case
 
     def _configure(self, name: str, words: list[str], text: str) -> str:
         if name in ("streamon", "streamoff"):
