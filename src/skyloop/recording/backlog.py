@@ -42,7 +42,7 @@ class Backlog:
     """A bounded first-in, first-out queue with any number of producers and one consumer."""
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
-        """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` bytes more."""
+        """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` more bytes."""
         self.dropped: Counts = Counter()  #: counts of dropped items
         self._limit = limit
         self._ceiling = limit + reserve

@@ -164,7 +164,7 @@ class Room(StrEnum):
     NOTHING = "nothing"
 
 
-_MARGIN: Final = 1.25  #: free space required before writing more again, as a multiple of the limit
+_MARGIN: Final = 1.25  #: free space required before writing resumes, as a multiple of the limit
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:

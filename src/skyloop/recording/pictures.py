@@ -166,7 +166,7 @@ class Group:
         self._units: list[bytes] = []
         self._context: VideoCodecContext | None = None
         self._done = 0  # number of units decoded so far
-        self._image: Any = None  # image of the last one decoded
+        self._image: Any = None  # image decoded last
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -125,7 +125,7 @@ def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
         for one in value.values() if isinstance(value, dict) else value:
             limited(one, depth - 1)
     elif type(value) is int and not MIN_INT <= value <= MAX_INT:
-        raise ValueError("a whole number of more than 64 bits")
+        raise ValueError("a whole number with more than 64 bits")
     return value
 
 
@@ -318,7 +318,7 @@ def reported_ns(value: Any) -> int | None:
     made_ns = getattr(value, "made_ns", None)  # from a result's record
     if made_ns is not None:
         return int(made_ns)
-    header = getattr(value, "header", None)  # from a frame's record or picture
+    header = getattr(value, "header", None)  # found in a frame's record or picture
     return None if header is None else int(header.published_ns)
 
 

@@ -334,7 +334,7 @@ START_S: Final = 20.0  #: time allowed for the child to start recording
 _END_S: Final = 15.0  # time allowed to write received samples before the child is terminated
 _HARDER_S: Final = 3.0  # time from terminating the child to killing it
 _TELL_S: Final = 0.25  # interval between the child's status reports
-_NICE: Final = 5  # niceness of the child: the flight has priority
+_NICE: Final = 5  # niceness of the child, so that flying takes precedence
 _log = logging.getLogger(__name__)
 
 

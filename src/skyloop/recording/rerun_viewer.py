@@ -64,7 +64,7 @@ from skyloop.recording.translation import Picture
 
 PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
-_AHEAD: Final = 8 * MB  #: bytes that the viewer may lag behind
+_AHEAD: Final = 8 * MB  #: maximum number of bytes not yet accepted by the viewer
 _PATIENCE_S: Final = 0.5  # time to wait for a slow viewer before dropping samples
 _ASK_NS: Final = nanoseconds(1.0)  # interval between checks that the viewer keeps up
 _LAST_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
@@ -91,7 +91,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer. If a viewer is already listening there, it is used. None: 9876; 0: any free port.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -313,7 +313,7 @@ class RerunLog:
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
         """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
-        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
+        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, one is made up.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))

@@ -53,7 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # mcap's, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Scan:
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
-    cut: str = ""  #: why the file is incomplete, in words; empty for a file with an index and an end
+    cut: str = ""  #: why the file is incomplete; empty for a file with an index and an end
     damaged: list[str] = field(default_factory=list)  #: descriptions of unreadable parts
     head: int = 0  #: bytes of metadata, schemas and channels kept in memory
 

@@ -377,7 +377,7 @@ class Parameters:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._ended = True
         self._wake.set()
         if self._thread.ident is not None:  # start() may have failed before starting the thread

@@ -262,7 +262,7 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write all received samples and close the file. If the disk hangs, leave it to the thread. Idempotent."""
+        """Write all received samples and close the file; if the disk hangs, leave this to the thread. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
@@ -295,7 +295,7 @@ class FileWriter:
     def _run(self) -> None:
         try:
             self._work()
-        except Exception as error:  # noqa: BLE001  (the state must never say that this still records)
+        except Exception as error:  # noqa: BLE001  (the state must never claim that this is still recording)
             self._fail(error)
 
     def _work(self) -> None:
@@ -462,7 +462,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """Pause because the disk fails. Samples not yet committed wait for the next file."""
+        """Pause because writing to the disk failed. Samples not yet committed wait for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()

@@ -233,7 +233,7 @@ def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) 
 
 
 def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int = 48) -> str:
-    """Draw a path in pieces whose colours run from that of the start to that of the end."""
+    """Draw a path in pieces whose colours run from the start colour to the end colour."""
     if len(points) < 2:
         return ""
     span = max(float(t_s[-1] - t_s[0]), 1e-9)

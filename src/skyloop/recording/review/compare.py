@@ -88,7 +88,7 @@ def compare(
 ) -> Comparison:
     """Compare the commands that applications requested (or those applied), excluding the proxies' own.
 
-    The times of a recorded replay are mapped to the old flight; otherwise the first commands are aligned.
+    The times of a recorded replay are mapped to those of the old flight; otherwise the first commands are aligned.
 
     Args:
         old: The older recording.

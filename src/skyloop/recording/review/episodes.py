@@ -85,7 +85,7 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
         raise FileFormatError("the recording has no set-points of an application: there is nothing to learn")
     if len(kinds) > 1 or kinds == {"position"}:
         raise UsageError(
-            f"the recording was flown by {' and '.join(sorted(kinds))} set-points: an action is either velocity "
+            f"the recorded flight used {' and '.join(sorted(kinds))} set-points: an action is either velocity "
             "(forward, left, up, yaw rate) or attitude (roll, pitch, climb, yaw rate)"
         )
     return Form(state, kinds.pop(), tuple(cameras), fps)
@@ -219,7 +219,7 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: images between key frames: training reads images in any order
+_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in any order
 _LOOKED_AT_EVERY: Final = 16  #: one in this many rows is sampled for the statistics
 _THINNED: Final = 4  #: only every fourth row and column of a sampled image is used
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}

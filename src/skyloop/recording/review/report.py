@@ -291,7 +291,7 @@ class Way:
     t_s: Floats
     x: Floats
     y: Floats
-    source: str  #: where the path comes from, in words
+    source: str  #: description of the path's source
 
     @property
     def length_m(self) -> float:
@@ -340,7 +340,7 @@ def airborne_s(feedback: Table) -> float:
 def flight_facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """Return the figures that are known for the head of a report, as names and values."""
+    """Return the known figures for a report's header, as names and values."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
@@ -418,7 +418,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    It has full size if it can't be scaled here; it is empty if damaged, or if it is H.264 that can't be decoded here.
+    It has full size if it can't be scaled here, and is empty if damaged or if it is H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

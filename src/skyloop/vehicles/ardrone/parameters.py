@@ -113,7 +113,7 @@ class Entry:
         if self.names:
             number = int(str(value))
             if not 0 <= number < len(self.names):
-                raise DecodeError(f"{text!r} is not the number of one of {', '.join(self.names)}")
+                raise DecodeError(f"{text!r} is not the index of one of {', '.join(self.names)}")
             return self.names[number]
         if self.divisor != 1.0 and isinstance(value, int | float):
             return value / self.divisor
@@ -258,7 +258,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen the range to include the present value, which shows that this drone allows more than is documented."""
+    """Widen the range to include the current value, which shows that this drone allows more than is documented."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))

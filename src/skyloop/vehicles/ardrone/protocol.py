@@ -30,7 +30,7 @@ FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes only those numbered higher than the last; a 1 restarts its count."""
+    """Numbers the commands. The drone executes one only if its number exceeds the last; a 1 restarts the count."""
 
     def __init__(self) -> None:
         self._sequence = 0
@@ -57,8 +57,8 @@ TICK_NS: Final = nanoseconds(0.03)  #: time between AT commands, as recommended 
 HURRY_NS: Final = nanoseconds(
     0.01
 )  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
-DEGRADED_NS: Final = nanoseconds(0.25)  #: silence after which the link is DEGRADED
-LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is LOST
+DEGRADED_NS: Final = nanoseconds(0.25)  #: time without data after which the link is DEGRADED
+LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link is LOST
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
 SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
@@ -169,7 +169,7 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even during a silence too short to count as a lost link.
+        """Detect that the drone restarted or lost us, even in a gap too short to count as a lost link.
 
         The drone may have lost its set-up in the process. Two consecutive datagrams must show the change.
         """

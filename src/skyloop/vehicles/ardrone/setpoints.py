@@ -59,7 +59,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the limits in force according to the drone's configuration; None if any is missing or not positive."""
+    """Return the current limits according to the drone's configuration; None if any is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):
@@ -106,8 +106,8 @@ def _share(value: float, limit: float) -> float:
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone not in the air after this long is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time of sending a take-off is ours, not another program's
-#: Navdata shows the effect of the emergency bit within this time, on both ends' clocks.
+RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after we sent a take-off is ours, not another program's
+#: Navdata shows the effect of the emergency bit within this time, whether by the drone's clock or by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
@@ -142,7 +142,7 @@ class Condition:
         return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
-#: After this much silence a flying drone may have landed, because it lands after 2 s without commands.
+#: After this long without contact a flying drone may have landed, because it lands after 2 s without commands.
 SILENT_NS: Final = nanoseconds(0.25)
 
 
@@ -277,8 +277,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. This tells
-        delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata; None if it equals the time that passed here.
+        This tells delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
@@ -297,7 +297,7 @@ class SetpointController:
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the drone itself may start the next one
+            self._landing_is_ours = False  # the next landing may be one that the drone starts itself
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)

@@ -1,10 +1,10 @@
 """The drone's video port: streams, frames and their times, decoders, and cameras.
 
 An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
-requesting them. The stamps in PaVE headers are the drone's own time in milliseconds, 32 bits
-(``video_encapsulation.h`` in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the
-capture. The intrinsics for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch)
-for 640×360 images; other drones differ by a few per cent. For the AR.Drone 1 none are known.
+requesting them. The stamps in PaVE headers are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h``
+in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. The intrinsics
+for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch) for 640×360 images; other
+drones differ by a few per cent. None are known for the AR.Drone 1.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ class PaveVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes MPEG-4 and H.264."""
         frame = coded.data
         if not isinstance(frame, PaveFrame):
-            raise TypeError("expected a frame of an AR.Drone 2")
+            raise TypeError("expected a frame from an AR.Drone 2")
         if frame.codec not in _DECODED:
             raise UnsupportedError(
                 f"the drone sends video in codec {_codec_name(frame.codec)}, which is not supported: "
@@ -291,7 +291,7 @@ class UvlcVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes UVLC, not P264."""
         packet = coded.data
         if not isinstance(packet, bytes):
-            raise TypeError("expected a datagram of an AR.Drone 1")
+            raise TypeError("expected a datagram from an AR.Drone 1")
         if is_p264(packet):
             raise UnsupportedError(
                 "the drone sends video in P264, which is not supported: set video:video_codec to UVLC (32)"

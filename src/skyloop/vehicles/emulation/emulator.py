@@ -1,4 +1,4 @@
-"""What every emulator runs on: its thread, its ports (UDP with faults, TCP for one client), and its life cycle."""
+"""The base of every emulator: its thread, its ports (UDP with faults, TCP for one client), and its life cycle."""
 
 from __future__ import annotations
 
@@ -285,7 +285,7 @@ class Closable(Protocol):
 
 
 class RunningEmulator(ABC):
-    """Firmware that runs from its construction to :meth:`stop`, which a constructor that fails half-way calls too.
+    """Firmware that runs from its construction to :meth:`stop`, which is also called if the constructor fails halfway.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
     read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, which its

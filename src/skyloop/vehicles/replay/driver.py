@@ -143,7 +143,7 @@ MAX: Final = "max"
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """A parsed address."""
+    """The contents of a parsed ``replay://`` address."""
 
     path: Path
     drone: str | None  #: the drone's name in the recording; None for the first drone

@@ -51,7 +51,7 @@ class Wanted:
 
     paused: bool
     speed: float
-    position_s: float | None = None  #: where to seek to; None to continue from the present position
+    position_s: float | None = None  #: position to seek to; None to continue from the current one
 
 
 class Playback:
@@ -64,7 +64,7 @@ class Playback:
         self.duration_s = duration_s
         self.position_s = 0.0  #: position in the recording, set by the player
         self.over = False  #: whether the end has been reached, set by the player
-        self.jumps = 0  #: number of changes in position other than by playing, set by the player
+        self.jumps = 0  #: number of changes in position other than by playing
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -113,7 +113,7 @@ class Playback:
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter, which takes effect at once; return the value in force.
+        """Write a parameter, which takes effect at once, and return its new value.
 
         Resuming at the end starts the replay over.
         """
@@ -129,7 +129,7 @@ class Playback:
             return value
         low, high = (0.0, self.duration_s) if name == POSITION else SPEEDS
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+            raise ParameterError(f"{name} must be from {low:g} to {high:g}, got {value!r}", code=Refusal.OUT_OF_RANGE)
         if name == POSITION:
             self._want(position_s=float(value))
         else:

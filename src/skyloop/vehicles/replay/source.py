@@ -50,7 +50,7 @@ class Moment:
 
 
 #: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
-#: has an image. A camera that was silent for longer shows nothing.
+#: has an image. A camera with no image in them shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
 _KEPT_STATES: Final = 500  #: states to keep from before the time sought, to find the one that matches the images
 
@@ -118,7 +118,7 @@ class ReplaySource:
     def samples(self) -> Iterator[TimedSample]:
         """Yield all samples in order of arrival; their times never go backwards."""
         for sample in self._timed(0):
-            if isinstance(sample.value, Parameter):  # earlier parameters are still in force
+            if isinstance(sample.value, Parameter):  # earlier parameters still apply
                 yield TimedSample(max(sample.at_ns, self.begin_ns), sample.value)
             elif sample.at_ns >= self.begin_ns:
                 yield sample
@@ -127,7 +127,7 @@ class ReplaySource:
 
     def _timed(self, log_ns: int) -> Iterator[TimedSample]:
         """Yield the samples received at the given log time or later."""
-        resets = self._resets if log_ns else []  # when reading from the beginning, they are found on the way
+        resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found on the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
         course = Course(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):

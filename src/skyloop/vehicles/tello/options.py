@@ -27,14 +27,14 @@ KNOWN: Final = {
 class VelocityAxes(StrEnum):
     """Possible axes of the drone's ``vgx`` and ``vgy``, which the SDK's guides do not specify."""
 
-    START = "start"  #: x along the heading at switch-on
-    BODY = "body"  #: x along its nose
-    NONE = "none"  #: values not used, so that feedback has no velocity
+    START = "start"  #: x along the heading when switched on
+    BODY = "body"  #: x along the drone's nose
+    NONE = "none"  #: ignore the values, so that feedback has no velocity
 
 
 @dataclass(frozen=True, slots=True)
 class TelloOptions:
-    """A parsed address."""
+    """The contents of a parsed ``tello://`` address."""
 
     host: str
     local: str | None = None  #: this host's address for sending and receiving

@@ -124,12 +124,12 @@ class Conversation:
 
 TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
-DEGRADED_NS: Final = nanoseconds(0.6)  #: silence after which the link is DEGRADED; state arrives ten times per second
-LOST_NS: Final = nanoseconds(1.5)  #: silence after which the link is LOST
+DEGRADED_NS: Final = nanoseconds(0.6)  #: time without state after which the link is DEGRADED; it arrives at 10 Hz
+LOST_NS: Final = nanoseconds(1.5)  #: time without state after which the link is LOST
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing within this time is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
-ALONE_NS: Final = nanoseconds(30.0)  #: a drone without commands has landed by then, having begun after 15 s
+ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without commands lands; it begins to after 15 s
 ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
 DEAF: Final = 2  #: consecutive unanswered requests that mean our commands are not being received
 VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
@@ -171,7 +171,7 @@ class TelloSession(VehicleSession):
         self._video_ns = video_ns
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
-        self._lost_ns = self._sent_ns = now_ns  # when the link was lost or hovering requested later; last datagram
+        self._lost_ns = self._sent_ns = now_ns  # time of the link loss or of a later hover request; last datagram
         self._alive_ns = self._found_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
@@ -180,7 +180,7 @@ class TelloSession(VehicleSession):
         self._rc_ns = 0
         self._flips: list[str] = []
         self._reported_ports = False
-        self._answered = False  # whether there was a reply while no state arrives
+        self._answered = False  # whether there has been a reply since state last arrived
         self.local = ""  #: this host's address on the route to the drone
         self._place = f"{options.host}, UDP port {options.port}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
@@ -335,7 +335,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
-        """Return whether to send no requests, because each delays the automatic landing of a drone without a pilot."""
+        """Return whether to withhold requests, because each delays the automatic landing of a drone without a pilot."""
         asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
         return asked and self.setpoints.flown_by_others
 

@@ -1,6 +1,6 @@
 """Convert set-points to sticks and motions. The last action is kept until the state shows that it is done. Pure.
 
-It does not rely on replies, which arrive seconds late or not at all. A take-off or landing is repeated until it shows.
+Replies may arrive seconds late or never, so it repeats a take-off or landing until it takes effect.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from skyloop.vehicles.tello.wire import (
     is_error,
 )
 
-FULL_TILT_RAD: Final = 0.2  #: attitude that a full stick stands for; chosen to equal an AR.Drone's tilt indoors
+FULL_TILT_RAD: Final = 0.2  #: attitude commanded by a full stick; chosen to equal an AR.Drone's tilt indoors
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Scale:
 
 
 def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
-    """Return the sticks, and the set-point that they command: within the limits, and at most a full stick.
+    """Return the stick values and the set-point that they command, within the limits and at most a full stick.
 
     The Tello holds a speed, not an attitude, so a tilt becomes a fraction of the full stick and thus of the full speed.
     """
@@ -110,7 +110,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state is arriving
-        #: Set after an abandoned stop or landing until the next command; our silence makes the drone land after 15 s.
+        #: Set after an abandoned stop or landing until the next command: we send nothing, so the drone lands in 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
@@ -302,9 +302,9 @@ class SetpointController:
         return []
 
     def stick(self) -> Stick | None:
-        """Return the sticks for ``rc``, or None not to send any.
+        """Return the stick values for ``rc``, or None to send none.
 
-        That is so if the drone is on the ground, taking off, landing, or flown by another program.
+        This is the case if the drone is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

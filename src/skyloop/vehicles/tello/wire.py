@@ -90,7 +90,7 @@ _ERROR: Final = re.compile(r"(error|unknown command|out of range|unactive|forced
 
 
 class Shape(Enum):
-    """Forms of replies other than errors."""
+    """Formats of replies other than errors."""
 
     OK = re.compile(r"ok\Z", re.IGNORECASE)
     NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
@@ -169,7 +169,7 @@ class State:
     height_cm: float | None = None  #: height above the take-off point; may be negative
     battery_percent: float | None = None
     barometer: float | None = None  #: as sent; the zero point and unit differ between versions
-    motor_s: int | None = None  #: total running time of the motors since switch-on
+    motor_s: int | None = None  #: total running time of the motors since the drone was switched on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None
     pads: bool = False  #: whether there are fields for pads
@@ -235,7 +235,7 @@ PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 or 0 if none is in view, for which some firmware sends 257
+    if number is None or number not in PADS:  # -1 or 0 if none is in view; some firmware then sends 257
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -261,7 +261,7 @@ class AccessUnit:
     is_key: bool  #: whether decoding can begin here
     arrived_ns: int  #: when its first piece arrived
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
-    whole: bool  #: whether no piece of this image seems to be missing
+    whole: bool  #: whether the image seems to be complete
     number: int = 0  #: count of images that have arrived
     width: int = 0  #: width according to the newest parameter set [px]; 0 before the first one
     height: int = 0
@@ -275,7 +275,7 @@ def pieces(picture: bytes) -> list[bytes]:
 class Assembly:
     """Assembles images from pieces in order of arrival. Never raises, whatever the input.
 
-    ``stray`` counts bytes that don't belong to any image, ``missing`` the images missing according to stream numbers.
+    ``stray`` counts bytes that don't belong to any image, ``missing`` counts images missing from the stream's numbers.
     """
 
     def __init__(self) -> None:

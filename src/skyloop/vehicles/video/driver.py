@@ -122,7 +122,7 @@ class VideoDriver(Driver):
         )
 
     def _publish_event(self, sink: Sink, event: VideoEvent, text: str) -> None:
-        """Publish a camera's event, as a link state if it changes that. Runs on either of the camera's threads."""
+        """Publish a camera's event, or the link state that it implies. Runs on either of the camera's threads."""
         if event is VideoEvent.STREAMING:
             self._streams = True
             sink.link(LinkState.UP)
@@ -208,7 +208,7 @@ class DeviceOptions:
 
 @dataclass(frozen=True, slots=True)
 class VideoOptions:
-    """A parsed address."""
+    """The contents of a parsed ``video://`` address."""
 
     place: str  #: path or address without secrets
     path: Path  #: path of the file

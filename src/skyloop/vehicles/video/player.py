@@ -45,7 +45,7 @@ class DecodedImage:
     frame: av.VideoFrame
     coded: Unit | None = None  #: its encoded form, if that is relayed unchanged
     number: int = 0  #: its number in the stream
-    reason: str = ""  #: why its encoded form is not relayed although the stream is
+    reason: str = ""  #: why this image is not relayed although its stream is
     turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
 
 

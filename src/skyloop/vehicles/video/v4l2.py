@@ -172,7 +172,7 @@ class V4l2Device:
         return self._set(GAIN, gain)
 
     def settings(self) -> list[str]:
-        """Return readable descriptions of exposure and gain: their ranges and present values."""
+        """Return readable descriptions of exposure and gain: their ranges and current values."""
         found = []
         exposure, mode = self.control(EXPOSURE), self.control(AUTO_EXPOSURE)
         if exposure is not None:

@@ -311,7 +311,7 @@ def test_steps_grow_with_the_quantiser_and_the_frequency(quality: int) -> None:
 @pytest.mark.parametrize(
     ("pairs", "match"),
     [
-        (run(62) + level(1) + run(0) + level(1), "a coefficient 64; 63 is the last"),
+        (run(62) + level(1) + run(0) + level(1), "a coefficient 64, but the last is 63"),
         (run(40) + level(1) + run(40) + level(1), "a coefficient 82"),
         (run(64) + level(1), "7 zeros cannot begin a run's code"),
         ("0" * 16, "zeros cannot begin a run's code"),
@@ -354,7 +354,7 @@ def test_a_picture_ends_after_its_last_group() -> None:
 
 @pytest.mark.parametrize("size", [0, 1, 3, 5, 191])
 def test_a_packet_consists_of_whole_words(size: int) -> None:
-    with pytest.raises(DecodeError, match=f"{size} bytes are not whole words"):
+    with pytest.raises(DecodeError, match=f"{size} bytes are not a whole number of 4-byte words"):
         UvlcDecoder().decode(packet(picture())[:size])
 
 

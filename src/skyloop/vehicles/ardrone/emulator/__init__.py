@@ -85,8 +85,8 @@ MOST: Final = 8  #: maximum number of recipients of datagrams
 class Listeners:
     """Recipients' addresses, each with its own sequence.
 
-    There are at most :data:`MOST`; one more replaces the one whose last request is the oldest. As with the real drone,
-    requests need not be repeated.
+    There are at most :data:`MOST`; a further one replaces the one that has made no request for longest. As with the
+    real drone, requests need not be repeated.
     """
 
     def __init__(self) -> None:
@@ -425,14 +425,14 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         bind: The local address to listen on.
         ports: The ports to listen on; 0 for any free one.
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
-        delay_s: Added to those datagrams, in each direction.
+        delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
         torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
             client, however old, and then the frames that follow, key frames or not. Otherwise its stream begins with
             the next key frame.
 
     Raises:
-        UsageError: The version or header size does not exist, or the delay is out of range.
+        UsageError: The version or header size is unknown, or the delay is out of range.
         MissingExtraError: A library that renders or encodes images is not installed.
     """
 
@@ -465,7 +465,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The actual ports, with those that were chosen for 0."""
+        """The actual ports, including those chosen where 0 was given."""
         return self._started.ports
 
     @property

@@ -34,7 +34,7 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: Limits that come in three versions: the one in force, one for indoors and one for outdoors.
+#: Limits that come in three versions: the current one, one for indoors and one for outdoors.
 TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
 #: Values in the emulated firmware (2.4.8 and 1.7.4) that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
@@ -88,7 +88,7 @@ class Configuration:
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
         """Handle a ``CONFIG`` with the ids received immediately before it, if any; return whether it was accepted.
 
-        While a custom session, user or application is in force, only commands with its ids are accepted, except for
+        While a custom session, user or application is active, only commands with its ids are accepted, except for
         ``custom:…_id``: otherwise no other client could ever start a custom one.
         """
         name = name.strip().lower()

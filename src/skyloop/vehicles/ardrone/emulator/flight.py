@@ -91,7 +91,7 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: silence before it hovers: general:com_watchdog in the Developer Guide (not checked)
+HOVER_AFTER_S: Final = 0.25  #: time without commands before it hovers: general:com_watchdog in the guide (unverified)
 LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
 BATTERY_RECOVERY_MV: Final = 500  #: how far above vbat_min a battery no longer counts as low; an estimate
@@ -168,7 +168,7 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: use the present attitude as level. Refused in the air."""
+        """Handle ``FTRIM``: use the current attitude as level. Refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 

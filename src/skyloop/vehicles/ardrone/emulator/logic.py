@@ -44,7 +44,7 @@ class CommandSequence:
         return True
 
 
-WATCHDOG_S: Final = 0.05  #: silence before the watchdog bit is set: Developer Guide, 7.1.2
+WATCHDOG_S: Final = 0.05  #: time without commands before the watchdog bit is set: Developer Guide, 7.1.2
 
 _ALWAYS: Final = (
     State.ALTITUDE_CONTROL
@@ -106,7 +106,7 @@ class ArdroneLogic:
         self._linked = False  # whether a command has arrived since the start or the last link loss
         self._watchdog = True
         self._ack = False
-        self.lost = False  #: whether the link counts as lost after a long silence
+        self.lost = False  #: whether the link counts as lost after a long time without commands
         self._ids: Ids | None = None  # ids received with the previous command
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)

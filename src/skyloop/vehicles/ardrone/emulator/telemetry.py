@@ -132,7 +132,7 @@ def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
 
 
 def _raw(s: Snapshot) -> o.Option:
-    """Return the raw measurements. The converters' scales are estimates; programs read the battery voltage here."""
+    """Return the raw measurements. The converters' scales are estimates, but programs read the battery voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
         gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),

@@ -103,7 +103,7 @@ class PavePacker:
         self._position = 0
 
     def pack(self, picture: NDArray[np.uint8], settings: VideoSettings, captured_ns: int) -> Piece | None:
-        """Encode an image and add its header; None if the encoder returned nothing."""
+        """Encode an image and add its header; return None if the encoder produced no output."""
         form = FORMATS[settings.codec]
         wanted = form, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:

@@ -161,7 +161,7 @@ class PairTable:
 
 @cache
 def pair_table() -> PairTable:
-    """Return the table, which is built at first use (taking tens of milliseconds)."""
+    """Return the table, which is built on first use (taking tens of milliseconds)."""
     rest = np.arange(1 << WINDOW)
     used = np.zeros_like(rest)
     count = np.zeros_like(rest)
@@ -276,12 +276,12 @@ class BlockWalker:
         advance[pairs_before[long_visit]] = long_advance
         level[pairs_before[long_visit]] = long_level
 
-        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # in pairs, for each block
+        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # counted in pairs, for each block
         travelled = np.concatenate([[0], np.cumsum(advance)])
         pairs = np.diff(ends)
         place = travelled[1:] - np.repeat(travelled[ends[:-1]], pairs)
         if place.size and place.max() >= COEFFICIENTS:
-            raise DecodeError(f"a block has a coefficient {place.max()}; {COEFFICIENTS - 1} is the last")
+            raise DecodeError(f"a block has a coefficient {place.max()}, but the last is {COEFFICIENTS - 1}")
         levels = np.zeros((pairs.size, COEFFICIENTS), np.float32)
         levels[np.repeat(np.arange(pairs.size), pairs), place] = level
         return levels
@@ -371,9 +371,9 @@ class _Reader:
 
     def __init__(self, packet: bytes) -> None:
         if len(packet) > MAX_PACKET:
-            raise DecodeError(f"{len(packet)} bytes are too many for a picture; at most {MAX_PACKET} are one datagram")
+            raise DecodeError(f"{len(packet)} bytes are too many for a picture; a datagram has at most {MAX_PACKET}")
         if len(packet) % 4 or not packet:
-            raise DecodeError(f"{len(packet)} bytes are not whole words of 4: the packet is torn")
+            raise DecodeError(f"{len(packet)} bytes are not a whole number of 4-byte words: the packet is torn")
         self._walker = BlockWalker(bit_windows(packet))
         self._window = self._walker.window
         self._end = 8 * len(packet)
@@ -437,7 +437,7 @@ class _Reader:
 
     def _read_quant(self) -> int:
         if not (quant := self._read(QUANT_BITS)):
-            raise DecodeError(f"a quantiser is {FINEST_QUANT} to {TABLE_QUANT}, not 0")
+            raise DecodeError(f"the quantiser must be from {FINEST_QUANT} to {TABLE_QUANT}, got 0")
         return quant
 
     def _read_macroblocks(self, group: int, count: int, quant: int) -> None:
@@ -500,7 +500,7 @@ def _changed_quant(quant: int, code: int) -> int:
         return quant
     changed = quant + DQUANT[code]
     if not FINEST_QUANT <= changed <= COARSEST_QUANT:
-        raise DecodeError(f"its quantiser would be {changed}, not {FINEST_QUANT} to {COARSEST_QUANT}")
+        raise DecodeError(f"its quantiser would be {changed}, outside {FINEST_QUANT} to {COARSEST_QUANT}")
     return changed
 
 

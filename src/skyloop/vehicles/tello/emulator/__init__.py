@@ -67,7 +67,7 @@ TELLO: Final = VehicleParameters(
     battery_empty_v=3.3,
     battery_charge_c=3960.0,  # 1100 mAh
     battery_resistance_ohm=0.03,
-    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, minus the electronics
+    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, minus what the electronics use
     electronics_power_w=2.0,
 )
 LIMITS: Final = Limits(
@@ -114,7 +114,7 @@ class Settings:
 
 STATE_HZ: Final = 10.0
 GROUP: Final = 30  #: number of images from one key frame to the next
-FULL_KBPS: Final = 2500  #: results in images of 10 kB
+FULL_KBPS: Final = 2500  #: makes images of about 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
 

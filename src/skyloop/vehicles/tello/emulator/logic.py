@@ -93,7 +93,7 @@ class Flipping:
 
 
 class Turning:
-    """``cw`` and ``ccw``: an angle, positive counter-clockwise, maybe several turns."""
+    """``cw`` and ``ccw``: turns by an angle, positive counter-clockwise, which may exceed a full turn."""
 
     def __init__(self, report: Report, by_rad: float) -> None:
         self._left_rad = by_rad
@@ -108,7 +108,7 @@ class Turning:
 
 
 class Going:
-    """Moves, ``go`` and ``curve``, by waypoints in world axes [m]."""
+    """Motions through waypoints in world axes [m]: moves, ``go`` and ``curve``."""
 
     def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
         self._places = list(places)
@@ -278,7 +278,7 @@ class TelloLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state_string(self) -> bytes | None:
-        """Return the present state string; None before the first report."""
+        """Return the current state string; None before the first report."""
         snapshot = self._snapshot()
         return None if snapshot is None else telemetry.state_string(snapshot, self._sdk)
 
