@@ -105,7 +105,7 @@ def numbered(path: Path, number: int) -> Path:
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to: the file (``.mcap`` by default), or in a folder, one named by drones and time.
+    """Return the path to record to: the file (``.mcap`` by default) or, in a folder, one named after drones and time.
 
     Raise ``UsageError`` if the file already exists, or its folder does not.
     """

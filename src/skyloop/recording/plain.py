@@ -1,4 +1,4 @@
-"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, no MCAP library.
+"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, without MCAP.
 
 The keys are the field names of the sample's class. Unknown values are absent, numbers that are not finite are null, and
 an extra key (``action``, ``shape``) distinguishes the members of a union.
@@ -298,7 +298,7 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 # own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is more than this before the newest one
+_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is earlier than the newest one by more than this
 _AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this after the newest one
 
 

@@ -212,7 +212,7 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """The current file, or the last one."""
+        """The current file or, if there is none, the last one."""
         return Path(self.status.path)
 
     @property

@@ -317,7 +317,7 @@ class RerunLog:
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
-        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which means nothing in a recording
+        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which is meaningless in a recording
         self._stream.set_log_tick_enabled(False)
         self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
         self._shown = drones
@@ -587,7 +587,7 @@ def rerun_sdk() -> Any:
 
 
 def _within(known: set[Any], name: Any) -> bool:
-    """Return whether an application's name gets an entity; their number is limited."""
+    """Return whether to create an entity for an application's name; the number of such names is limited."""
     if name not in known and len(known) < _MOST_SERIES:
         known.add(name)
     return name in known

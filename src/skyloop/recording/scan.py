@@ -475,7 +475,7 @@ def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
 
 
 def _is_gapless(spans: list[tuple[int, int]], begin: int, end: int) -> bool:
-    """Return whether spans cover the range between two offsets without any gap."""
+    """Return whether spans cover the range between two offsets without gaps."""
     for start, stop in spans:
         if start != begin or stop < start:
             return False

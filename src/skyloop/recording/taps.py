@@ -229,7 +229,7 @@ class Stream:
 class Video:
     """One camera's frames. They are encoded on a separate thread unless they arrive as JPEG.
 
-    If the vehicle's encoding is kept, decoded frames are subscribed to only while its stream does not arrive.
+    If the vehicle's encoding is kept, decoded frames are subscribed to only while its stream is not arriving.
     """
 
     def __init__(

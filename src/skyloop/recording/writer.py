@@ -208,13 +208,13 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise without opening a file. ``tell`` runs on the writing thread, or at first on :meth:`start`'s."""
+        """Initialise without opening a file. ``tell`` is called on the writing thread or, at first, :meth:`start`'s."""
         self.state = RecorderState.STARTING  #: state of the recorder
         self.reason = ""  #: why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
         self.room = Room.ALL  #: which samples to write, given the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
-        self.unwritable_why = ""  #: channel and error of the last one
+        self.unwritable_why = ""  #: channel and error of the last such sample
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
         #: returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict

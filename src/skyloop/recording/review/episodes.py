@@ -302,7 +302,7 @@ class Film:
             self._begin(width, height)
         if (width, height) != (self.width, self.height):
             raise UsageError(
-                f"{path} has images of {width}×{height}, the first ones were {self.width}×{self.height}: "
+                f"{path} has {width}×{height} images, but the first ones were {self.width}×{self.height}: "
                 "export mismatched recordings separately"
             )
         if self._rows % _LOOKED_AT_EVERY == 0:

@@ -25,7 +25,7 @@ from skyloop.vehicles.ardrone.telemetry import (
 from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
 from skyloop.vehicles.ardrone.wire.navdata import Demo, Navdata, State
 
-#: Number of datagrams that begin at sequence 1 after a restart; one may be lost, and only a 1 resets the drone's count.
+#: Number of datagrams that begin at sequence 1 after a restart: one may be lost, and only a 1 resets the drone's count.
 FRESH_DATAGRAMS: Final = 3
 
 
@@ -59,7 +59,7 @@ HURRY_NS: Final = nanoseconds(
 )  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
 DEGRADED_NS: Final = nanoseconds(0.25)  #: time without data after which the link is DEGRADED
 LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing within this time is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
 SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
 SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after this the link is DEGRADED and the drone may fly without set-up

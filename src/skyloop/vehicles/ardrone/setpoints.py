@@ -169,12 +169,12 @@ class SetpointController:
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
-        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
+        self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._releasing = False  # whether a reset was requested that does not show in navdata yet
         self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
         self._bit_due = False  # whether to set the bit next, regardless of navdata
-        self._changed_ns = 0  # time of the last change of or request for the bit, or of the end of an emergency
+        self._changed_ns = 0  # when the bit last changed or was requested, or an emergency ended
         self._passed_ns = 0  # the drone's own time from then until the newest navdata
         self._received_ns = 0
         self._late_ns = 0  # age of the delayed navdata that arrives in a burst after a gap

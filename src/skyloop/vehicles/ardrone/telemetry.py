@@ -285,7 +285,7 @@ _REASONS: Final = (
 
 
 def emergency_reason(state: State) -> str:
-    """Return why the motors are cut, as names separated by commas, or ``unknown``."""
+    """Return the reasons why the motors are cut, separated by commas, or ``unknown``."""
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 

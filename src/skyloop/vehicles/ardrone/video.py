@@ -1,7 +1,7 @@
 """The drone's video port: streams, frames and their times, decoders, and cameras.
 
 An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
-requesting them. The stamps in PaVE headers are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h``
+requesting them. The stamps in PaVE headers are the drone's own time in 32-bit milliseconds (``video_encapsulation.h``
 in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. The intrinsics
 for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch) for 640×360 images; other
 drones differ by a few per cent. None are known for the AR.Drone 1.
@@ -140,7 +140,7 @@ class PaveAssembly:
 
 
 CONNECT_S: Final = 1.0  #: connection timeout
-POLL_S: Final = 0.1  #: longest time that a read waits
+POLL_S: Final = 0.1  #: maximum time that a read blocks
 SILENT_S: Final = 3.0  #: the connection is closed if no complete frame arrives for this long
 KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
 WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1: any small datagram starts the video and keeps it running

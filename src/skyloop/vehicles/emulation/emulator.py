@@ -125,7 +125,7 @@ _SEND_BUFFER: Final = 1 << 20  # bytes, with room for an AR.Drone 1's images
 
 
 class DatagramPort:
-    """A UDP port that replies to the address each datagram came from. Used on the loop's thread."""
+    """A UDP port that replies to the address each datagram came from. Use only on the loop's thread."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ _BUFFER: Final = 1 << 16
 class ByteServer:
     """Serves one client at a time. Meanwhile the next one waits in the kernel's backlog, connected but unanswered.
 
-    Used on the loop's thread.
+    Use only on the loop's thread.
     """
 
     def __init__(
@@ -339,7 +339,7 @@ class RunningEmulator(ABC):
             self._loop.post(partial(self._crashed, occurrence.text))
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate or 0."""
+        """Return the frame rate at which to render this camera: its full rate or 0."""
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
@@ -355,7 +355,7 @@ class RunningEmulator(ABC):
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 
-LONGEST_DELAY_S: Final = 10.0  #: greatest delay that can be configured for datagrams
+LONGEST_DELAY_S: Final = 10.0  #: maximum delay that can be configured for datagrams
 NO_FAULTS: Final = Faults()
 
 R = TypeVar("R", bound=RunningEmulator)

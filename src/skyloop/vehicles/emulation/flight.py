@@ -62,7 +62,7 @@ LIMITS: Final = Limits(
 )
 PLACE_GAIN_PER_S: Final = 0.9  #: speed per metre of distance from a position
 YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per radian of heading error
-YAW_RATE_RAD_S: Final = 1.5  #: greatest yaw rate while turning to a heading
+YAW_RATE_RAD_S: Final = 1.5  #: maximum yaw rate while turning to a heading
 GO_M_S: Final = 3.0  #: default horizontal speed towards a position
 SINK_M_S: Final = 1.5  #: default rate of climb and descent towards a position
 HEADROOM_M: Final = 1.0  #: clearance kept below the ceiling
@@ -117,7 +117,7 @@ class FlightControl:
 
     @property
     def highest_m(self) -> float:
-        """The greatest height that the vehicle can reach; a climb beyond it would never end."""
+        """The maximum height that the vehicle can reach; a climb beyond it would never end."""
         return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
 
     @property

@@ -238,7 +238,7 @@ class Encoder:
         self._count = 0
 
     def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
-        """Encode an image: BGR, uint8, shape (height, width, 3), of any size. None if the encoder returned nothing."""
+        """Encode an image: BGR, uint8, shape (height, width, 3), any size; return None if the encoder has no output."""
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")

@@ -294,7 +294,7 @@ class ReplayPublisher:
         show(self._captured(picture.camera, picture.header.captured_ns, timeline))
 
     def _decoded(self, picture: Picture) -> Callable[[int], None]:
-        """Decode an image. Return a function that publishes it, or an event if it is damaged, at a capture time."""
+        """Decode an image; return a function that publishes it with a given capture time or, if damaged, an event."""
         try:
             pixels, encoding = picture.as_recorded()
         except SkyloopError as error:

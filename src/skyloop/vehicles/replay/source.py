@@ -102,7 +102,7 @@ class ReplaySource:
 
     @property
     def damaged(self) -> list[str]:
-        """Readable descriptions of the unreadable parts."""
+        """Descriptions of the unreadable parts."""
         cut = self._recording.cut
         return [*([f"the file was cut off: {cut}"] if cut else []), *self._recording.damaged]
 

@@ -86,7 +86,7 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
 
 AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that has no visible effect within this time is repeated
 TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone not in the air after this long is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: a take-off may start until this long after it was sent; real drones take 1.1 s
+RISES_NS: Final = nanoseconds(3.0)  #: a take-off may begin up to this long after it was sent; real drones take 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
@@ -102,7 +102,7 @@ class Decision(Enum):
 class SetpointController:
     """Stores the last action and turns it into commands.
 
-    ``full`` is the effect of a full stick, ``limits`` the largest set-point.
+    ``full`` is the effect of a full stick, and ``limits`` is the largest set-point.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state is arriving
-        #: Set after an abandoned stop or landing until the next command: we send nothing, so the drone lands in 15 s.
+        #: Set after an abandoned stop or landing until the next command: we send nothing, so it lands after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY

@@ -1,12 +1,12 @@
 """The Ryze Tello's text protocol: commands, replies, state and video. Pure.
 
-Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". What SDK 3.0 (Tello Talent, and EDU with newer firmware)
-adds is known from the commands that djitellopy sends.
+Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". The additions in SDK 3.0 (Tello Talent, and EDU with
+newer firmware) are known from the commands that djitellopy sends.
 
 A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
 only if it has the format of that command's replies.
 
-State arrives ten times per second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
+State arrives ten times per second; unknown values are None. Axes follow aviation: x forward, y right, z down;
 positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm this for both
 attitude and acceleration: a Tello that reports a pitch of 8° reports 0.116 g along x.
 
@@ -119,7 +119,7 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Return the form of a command's reply."""
+    """Return the format of a command's reply."""
     return READ.get(command, Shape.OK)
 
 

@@ -113,7 +113,7 @@ def test_a_port_in_use_is_named_and_reused_after_a_restart() -> None:
         host = SimHost(with_tellos(SimOptions(world="empty")))
         with pytest.raises(LinkError, match=r"the drone's command port, UDP 8889 on .* can't be opened"):
             TelloFirmware(host, bind=firmware.settings.bind).start()
-        with pytest.raises(UsageError, match="started already"):
+        with pytest.raises(UsageError, match="already running"):
             firmware.start()
         firmware.stop()
         firmware.start()

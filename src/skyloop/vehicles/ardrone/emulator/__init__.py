@@ -8,7 +8,7 @@ To use it on free local ports, as in a test::
 
     host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
     with ArdroneFirmware(host, version=2, ports=Ports.free()) as firmware:
-        ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP of version 1), .control (TCP)
+        ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP for version 1), .control (TCP)
         host.simulation.truth(0).position_m  # the vehicle's true position
 
 ``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` drops
@@ -405,7 +405,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads -------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
+        """Return the frame rate at which to render this camera: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self._seen else 0.0
 
 

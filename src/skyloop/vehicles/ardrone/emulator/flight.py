@@ -190,7 +190,7 @@ class FlightControl:
         return now_ns < self._calibrating_until_ns
 
     def flipping(self, now_ns: int) -> bool:
-        """Return whether the duration of a requested flip is not over yet."""
+        """Return whether a requested flip is still in progress."""
         return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
 
     # Supervision -----------------------------------------------------------------------------------------------

@@ -413,7 +413,7 @@ class Ports:
 
     @classmethod
     def free(cls) -> Ports:
-        """Return ports that are all 0, for any free ones."""
+        """Return ports that are all 0, which stands for any free ones."""
         return cls(0, 0, 0, 0)
 
 

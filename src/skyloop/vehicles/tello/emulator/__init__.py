@@ -237,7 +237,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
+        """Return the frame rate at which to render this camera: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self.logic.streaming and self.logic.client is not None else 0.0
 
 
