@@ -115,7 +115,7 @@ def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_do_not_cou
     assert not episode.action[25:].any()
     assert episode.action[5].any()
     own = replace(commands, columns={**commands.columns, "app_id": np.zeros(len(commands), np.int64)})
-    with pytest.raises(FileFormatError, match="no set-points of an application"):
+    with pytest.raises(FileFormatError, match="no set-points from an application"):
         form_of({**found, "commands": own}, ["front"], 10.0)
 
 

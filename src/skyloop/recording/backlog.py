@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from skyloop.recording.options import MB
 
-RESERVE: Final = 64 * MB  #: bytes above the limit, reserved for samples that must not be dropped
+RESERVE: Final = 64 * MB  #: additional bytes, reserved for samples that must not be dropped
 
 
 class Rank(IntEnum):
@@ -31,7 +31,7 @@ class Item:
     rank: Rank
     received_ns: int  #: time of reception on this process's monotonic clock
     sample: Any
-    size: int  #: bytes, approximately
+    size: int  #: approximate size [bytes]
 
 
 #: Counts by drone and channel.

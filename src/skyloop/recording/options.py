@@ -144,7 +144,7 @@ class Status(msgspec.Struct, frozen=True):
     seconds: float = 0.0  #: time since the start
     bytes: int = 0  #: total size of all files
     messages: int = 0
-    waiting: int = 0  #: bytes received but not written yet
+    waiting: int = 0  #: number of bytes received but not yet written
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
     missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel
 

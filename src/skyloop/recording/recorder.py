@@ -283,7 +283,7 @@ def record(
 
     Args:
         drones: Connected drones, or names of running proxies.
-        path: A file, or a folder, for which a file name is chosen.
+        path: A file, or a folder in which to create a file with a generated name.
         channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
             ``video`` and ``video.CAMERA``; None records everything.
         encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
@@ -352,7 +352,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
     status: Status | None = None
     event: RecorderEvent | None = None
     trouble: str = ""  #: why the child could not start
-    usage: bool = False  #: whether that was a UsageError
+    usage: bool = False  #: whether the cause was a UsageError
 
 
 # The child -----------------------------------------------------------------------------------------------------

@@ -104,7 +104,7 @@ class RerunViewer:
         check_names(drones, "view")
         rerun_sdk()
         self.left_out = 0  #: samples dropped because the viewer was too slow
-        self._ahead = 0  # bytes that the viewer may not have accepted yet
+        self._ahead = 0  # number of bytes that the viewer may not have accepted yet
         self._stalled = False
         self._due_ns = 0
         self._chains: dict[tuple[int, str], Chain] = {}  # the H.264 frames shown so far
@@ -368,7 +368,7 @@ class RerunLog:
         # Disconnecting, now or when Python exits, could wait for the viewer forever.
         threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
         self._rr.unregister_shutdown()
-        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs, or is closed")
+        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs or is closed")
 
     def _begin(self) -> None:
         self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

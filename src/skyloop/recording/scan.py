@@ -24,13 +24,13 @@ from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 MAX_CHUNK: Final = 64 << 20
 #: Maximum compression ratio of a chunk. LZ4 reaches at most 255, and nearly constant data 150.
 MAX_RATIO: Final = 512
-MAX_RECORD: Final = 8 << 20  #: bytes in a metadata record, a schema or a channel; Skyloop's have a few kilobytes
+MAX_RECORD: Final = 8 << 20  #: maximum size of a metadata record, schema or channel [bytes]; Skyloop's have a few kB
 #: Bytes of metadata, schemas and channels, which are kept in memory. In a recording of 100 drones they take about 1 MB.
 MAX_HEAD: Final = 32 << 20
-MAX_PIECES: Final = 500_000  #: chunks in a file; a recorder that closes one per second gets there after five days
-MAX_RECORDS: Final = 5_000_000  #: records outside chunks; Skyloop's recordings have a few hundred
+MAX_PIECES: Final = 500_000  #: maximum number of chunks; at one per second, a recorder writes these in five days
+MAX_RECORDS: Final = 5_000_000  #: maximum number of records outside chunks; Skyloop writes a few hundred
 MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
-_RUN: Final = 4 << 20  #: bytes of messages outside chunks to read at once
+_RUN: Final = 4 << 20  #: size of the messages outside chunks to read at once [bytes]
 
 try:
     from mcap.data_stream import ReadDataStream
@@ -83,7 +83,7 @@ class Scan:
     attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
     cut: str = ""  #: why the file is incomplete; empty for a file with an index and an end
     damaged: list[str] = field(default_factory=list)  #: descriptions of unreadable parts
-    head: int = 0  #: bytes of metadata, schemas and channels kept in memory
+    head: int = 0  #: size of the metadata, schemas and channels kept in memory [bytes]
 
     def damage(self, what: str) -> None:
         """Add a description of an unreadable part, unless it is already listed."""
@@ -294,8 +294,8 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
         raise ValueError(
-            f"{len(data)} bytes that announce {size} when unpacked, but the limits are {MAX_RATIO} times as many and "
-            f"{MAX_CHUNK} in all"
+            f"{len(data)} bytes claim to unpack to {size}, but at most {MAX_RATIO} times as many and "
+            f"at most {MAX_CHUNK} are allowed"
         )
     size = min(size, MAX_CHUNK, MAX_RATIO * len(data))
     if piece.compression == "":

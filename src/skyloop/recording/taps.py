@@ -55,7 +55,7 @@ def check_names(drones: Sequence[Drone], of: str) -> None:
     """
     names = [drone.name for drone in drones]
     if len(set(names)) < len(names):
-        raise UsageError(f"the drones of one {of} need different names, got {', '.join(names)}")
+        raise UsageError(f"the drones of a {of} must have different names, got {', '.join(names)}")
 
 
 class Gaps:
@@ -417,8 +417,8 @@ class Parameters:
 
 
 BEAT_S: Final = 0.02  #: interval between polls of the backlog; polling spares receiving threads from waking the view
-_BATCH: Final = MB  # bytes to show before asking the screen again which sources it needs
-_LIMIT: Final = 16 * MB  # bytes held for a slow screen; older images are useless to a viewer
+_BATCH: Final = MB  # number of bytes to show before asking the screen again which sources it needs
+_LIMIT: Final = 16 * MB  # maximum number of bytes held for a slow screen; older images are useless to a viewer
 _RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
 _LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the streams

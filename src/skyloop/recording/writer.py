@@ -1,4 +1,4 @@
-"""The writing thread: takes samples from the backlog, translates and writes them, and monitors the disk; its files."""
+"""The writing thread and its files: takes samples from the backlog, translates and writes them, watches the disk."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from skyloop.recording.translation import Message, Picture, Schema, Translator
 CHUNK: Final = MB  #: a chunk is closed after this many bytes, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
 _COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
-_REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
+_REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that was full
 #: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
 _SILENCE_NS: Final = nanoseconds(2.0)  #: if no H.264 arrives for this long, a full file does not wait for a key frame
@@ -63,8 +63,8 @@ class Output:
     """The MCAP writer's stream. Nothing reaches the file until :meth:`flush`, which writes everything or nothing."""
 
     def __init__(self, target: Target) -> None:
-        self.committed = 0  #: bytes in the file, always ending at a record boundary
-        self.waiting = 0  #: bytes not yet in the file
+        self.committed = 0  #: number of bytes in the file, which end at a record boundary
+        self.waiting = 0  #: number of bytes not yet in the file
         self._target = target
         self._pieces: list[bytes] = []
 

@@ -75,14 +75,14 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
     if not state:
-        raise FileFormatError("the recording has no states of the drone: record the channel feedback")
+        raise FileFormatError("the recording has no state of the drone: record the feedback channel")
     for camera in cameras:
         if f"frames.{camera}" not in tables:
             raise FileFormatError(f"the recording has no frames of {camera}")
     asked: set[str] = set() if commands is None else {str(name) for name in commands["asked"][_piloted(commands)]}
     kinds = asked & (ACTIONS.keys() | {"position"})
     if not kinds:
-        raise FileFormatError("the recording has no set-points of an application: there is nothing to learn")
+        raise FileFormatError("the recording has no set-points from an application, so there is nothing to learn")
     if len(kinds) > 1 or kinds == {"position"}:
         raise UsageError(
             f"the recorded flight used {' and '.join(sorted(kinds))} set-points: an action is either velocity "

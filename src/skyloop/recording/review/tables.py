@@ -290,7 +290,7 @@ def read(
     """Read the tables to export. Raise ``FileFormatError`` if the recording has none of these channels."""
     found = tables(recording, drone, channels or TABLES, progress)
     if not found:
-        raise FileFormatError(f"{recording.path} holds none of these channels of {drone}")
+        raise FileFormatError(f"{recording.path} contains none of these channels for {drone}")
     return found
 
 

@@ -100,7 +100,7 @@ class ReplayDriver(Driver):
     def _open_steps(self, source: ReplaySource, sink: Sink) -> None:
         if self.clock is None:
             raise UsageError(
-                f'{self.uri}: speed=max is in step with one application: call skyloop.connect("{self.uri}") there, '
+                f'{self.uri}: speed=max runs in step with one application: call skyloop.connect("{self.uri}") there, '
                 "or give a number, such as speed=10, to serve any client"
             )
         self._playback = Playback(source.seconds, in_step=True)

@@ -41,7 +41,7 @@ def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.soc
         if error.errno == errno.EADDRINUSE:
             raise OSError(
                 error.errno,
-                f"UDP port {port} of {local} is in use: stop the other program, or see docs/tello.md for more drones",
+                f"UDP port {port} on {local} is in use: stop the other program, or see docs/tello.md for more drones",
             ) from error
         raise
     return made

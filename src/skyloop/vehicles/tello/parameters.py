@@ -211,7 +211,7 @@ class DroneSettings:
         name = setting.parameter.name
         if reply is None:
             raise ParameterError(
-                f"{name}: the drone did not answer {command!r}; it answers nothing while it takes off or lands",
+                f"{name}: the drone did not answer {command!r}; it does not reply while taking off or landing",
                 code=Refusal.DRIVER_FAILED,
             )
         if is_error(reply):

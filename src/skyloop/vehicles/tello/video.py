@@ -118,7 +118,7 @@ class VideoStream:
         if wait_readable(self._socket, POLL_S):
             self._drain(frames)
         if self._clock() - self._received_ns > nanoseconds(SILENT_S):
-            raise TimeoutError(f"no video came for {SILENT_S:g} s")
+            raise TimeoutError(f"no video arrived for {SILENT_S:g} s")
         return frames
 
     def close(self) -> None:

@@ -38,7 +38,7 @@ MAX_STICK: Final = 100
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: characters; all commands and replies in the SDK are much shorter
+MAX_COMMAND: Final = 256  #: in characters; all commands and replies in the SDK are much shorter
 
 
 class Sdk(StrEnum):
@@ -186,7 +186,7 @@ def parse(datagram: bytes) -> State:
     try:
         text = datagram.decode("ascii")
     except UnicodeDecodeError:
-        raise DecodeError("a state string with bytes that are not ASCII") from None
+        raise DecodeError("the state string has bytes that are not ASCII") from None
     fields: dict[str, float | Vector] = {}
     for part in text.strip("\r\n\0 ").split(";")[:FIELDS]:
         match = _FIELD.match(part)
@@ -247,8 +247,8 @@ def build(fields: list[tuple[str, str]]) -> bytes:
     return ("".join(f"{name}:{value};" for name, value in fields) + "\r\n").encode("ascii")
 
 
-PIECE: Final = 1460  #: bytes in every datagram of an image except the last one
-MAX_PICTURE: Final = 1 << 19  #: bytes; real images have a fiftieth of that
+PIECE: Final = 1460  #: size of every datagram of an image except the last [bytes]
+MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real ones have a fiftieth of that
 _SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 

@@ -266,7 +266,7 @@ def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
 def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
     """Raise an error if the options do not fit the source."""
     if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
-        raise UsageError(f"{uri}: loop and speed are for files, not live cameras")
+        raise UsageError(f"{uri}: loop and speed apply only to files, not to live cameras")
     unfit = {
         "only a device or a stream has": _LIVE if source is None else (),
         "only a device has": _DEVICE if source is None or source.scheme else (),

@@ -87,7 +87,7 @@ class ContainerSource:
         videos = self._container.streams.video
         if not videos:
             self._container.close()
-            raise FileFormatError(f"{name} holds no video stream")
+            raise FileFormatError(f"{name} contains no video stream")
         self._stream = videos[0]
         limit_memory(self._stream.codec_context)
         self._stream.thread_type = "AUTO"

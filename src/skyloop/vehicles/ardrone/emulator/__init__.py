@@ -241,7 +241,7 @@ DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 
 
 class RunningFirmware(RunningEmulator):
-    """An AR.Drone that is switched on. Its logic, ports and lists of clients belong to the loop's thread."""
+    """An AR.Drone that is switched on. Use its logic, ports and lists of clients only on the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
@@ -452,7 +452,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         if version not in VERSIONS:
             raise UsageError(f"the AR.Drone's version must be 1 or 2, got {version!r}")
         if header_size not in (64, 68):
-            raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
+            raise UsageError(f"header_size must be 64 or 68, got {header_size!r}")
         if version > 1:
             require_encoder()
         super().__init__(host, drone)
@@ -470,5 +470,5 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Use it only on the loop's thread."""
         return self._started.logic

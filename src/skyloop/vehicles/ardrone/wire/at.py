@@ -17,7 +17,7 @@ from typing import Final, TypeAlias
 from skyloop.errors import UsageError
 
 PORT: Final = 5556
-MAX_LINE: Final = 1024  #: characters; the drone drops longer lines
+MAX_LINE: Final = 1024  #: maximum length of a line [characters]; the drone drops longer ones
 SILENCE_RESET_S: Final = 2.0  #: after this long without commands the drone expects the sequence to restart at 1
 
 Argument: TypeAlias = int | float | str

@@ -360,10 +360,10 @@ def decode(datagram: bytes | memoryview) -> Navdata:
         raise DecodeError(f"{len(datagram)} bytes are not navdata")
     signature, state, sequence, vision_defined = _HEADER.unpack_from(datagram)
     if signature != SIGNATURE:
-        raise DecodeError(f"navdata begins with {SIGNATURE:#x}, not with {signature:#x}")
+        raise DecodeError(f"navdata must begin with {SIGNATURE:#x}, got {signature:#x}")
     tag, size, checksum = _CHECKSUM.unpack_from(datagram, end)
     if tag != _CHECKSUM_TAG or size != _CHECKSUM.size:
-        raise DecodeError("navdata that does not end with a checksum")
+        raise DecodeError("navdata does not end with a checksum")
     if checksum != sum(datagram[:end]):
         raise DecodeError(f"navdata {sequence} is damaged: its checksum is wrong")
     options, unknown = _decode_options(datagram, end)
@@ -386,7 +386,7 @@ def _decode_options(datagram: bytes | memoryview, end: int) -> tuple[dict[type[O
     at = _HEADER.size
     while at < end:
         if at + _OPTION.size > end:
-            raise DecodeError("navdata with bytes that belong to no option")
+            raise DecodeError("navdata has bytes that belong to no option")
         tag, size = _OPTION.unpack_from(datagram, at)
         if size < _OPTION.size or at + size > end:
             raise DecodeError(f"navdata option {tag} of {size} bytes does not fit in its datagram")

@@ -18,7 +18,7 @@ SIGNATURE: Final = b"PaVE"
 MIN_HEADER: Final = 64
 MAX_HEADER: Final = 128
 MAX_SIDE: Final = 4096
-DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: bytes; the drone's 720p key frames are smaller than 100 kB
+DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: in bytes; the drone's 720p key frames are smaller than 100 kB
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and including advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1
@@ -97,7 +97,7 @@ def build_header(
     unless ``header_size`` is 64 or 68.
     """
     if header_size not in (MIN_HEADER, _HEADER.size + _RESERVED.size):
-        raise UsageError(f"a header has 64 bytes, as early firmware writes it, or 68, not {header_size}")
+        raise UsageError(f"header_size must be 64, as in early firmware, or 68, got {header_size}")
     encoded_width, encoded_height = (-(-side // _MACROBLOCK) * _MACROBLOCK for side in (width, height))
     sides = encoded_width, encoded_height, width, height
     low, high = position & 0xFFFFFFFF, position >> 32 & 0xFFFFFFFF

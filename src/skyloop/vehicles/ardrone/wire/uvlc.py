@@ -289,7 +289,7 @@ class BlockWalker:
 
 # Pictures ------------------------------------------------------------------------------------------------------------
 
-MAX_PACKET: Final = 65_535  #: bytes, because a picture is one datagram
+MAX_PACKET: Final = 65_535  #: maximum size of a picture, which is one datagram [bytes]
 _MAX_TAIL_BITS: Final = 64  # zeros that pad the last word after the end of the picture
 # Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
 # also be rounded up by half a step.
@@ -385,7 +385,7 @@ class _Reader:
     def read_header(self) -> UvlcHeader:
         code = self._read(START_CODE_BITS)
         if code == P264_START:
-            raise DecodeError("a picture of P264, which is not supported: set video:video_codec to UVLC (0x20)")
+            raise DecodeError("P264 pictures are not supported: set video:video_codec to UVLC (0x20)")
         if code != UVLC_START:
             raise DecodeError(f"a UVLC picture must begin with {UVLC_START:#08x}, got {code:#08x}")
         form, resolution = self._read(FORMAT_BITS), self._read(RESOLUTION_BITS)

@@ -144,7 +144,7 @@ class TelloPacker:
 
 
 class RunningFirmware(RunningEmulator):
-    """A Tello that is switched on. Its logic and ports belong to the loop's thread."""
+    """A Tello that is switched on. Use its logic and ports only on the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-tello")
@@ -277,7 +277,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
             raise UsageError(f"sdk must be one of {', '.join(Sdk)}, got {sdk!r}")
         for number in pads or {}:
             if not 1 <= number <= MOST:
-                raise UsageError(f"mission pads are numbered from 1 to {MOST}, not {number!r}")
+                raise UsageError(f"mission pads are numbered from 1 to {MOST}, got {number!r}")
         require_encoder("the video of an emulated Tello")
         super().__init__(host, drone)
         self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))

@@ -39,7 +39,7 @@ from skyloop.vehicles.tello.wire import (
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
 RISES_WITHIN_S: Final = 0.5  #: if it has not risen within this simulated time, take-off was refused for a low battery
-TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although it hovered long before
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although the drone hovered long before
 FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
 PATIENCE_S: Final = 30.0  #: a command that takes longer than this fails
@@ -48,7 +48,7 @@ _SLOW_M_S: Final = 0.12  # … and below this speed
 _NEAR_RAD: Final = 0.03  # a turn ends within this angle
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
-#: The vehicle's next command, and the reply if the command that was running is over.
+#: The vehicle's next command, and the reply if the running command has ended.
 Step = tuple[AnyAction | None, str | None]
 
 
