@@ -211,7 +211,7 @@ def test_unwritable_paths_are_refused(flight: Path, tmp_path: Path) -> None:
         export_npz(found, tmp_path / "x")
     with pytest.raises(UsageError, match="can't be written: No such file"):
         export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "nowhere" / "x.mp4")
-    with pytest.raises(FileFormatError, match="holds none"):
+    with pytest.raises(FileFormatError, match="contains none"):
         read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))
 
 

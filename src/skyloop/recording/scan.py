@@ -144,7 +144,7 @@ def has_room(found: Scan, size: int) -> bool:
     """Return whether ``size`` more bytes can be kept in memory; if not, list that as damage."""
     found.head += size
     if found.head > MAX_HEAD:
-        found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels: the others are left out")
+        found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels; the rest are skipped")
     return found.head <= MAX_HEAD
 
 

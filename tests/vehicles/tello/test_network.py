@@ -89,7 +89,7 @@ def test_a_port_in_use_is_reported_and_taken_when_free() -> None:
         uri = f"tello://{firmware.settings.bind}?local={addresses.pilot}&video=0"
         with opened(uri) as (_, sink):
             assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
-            assert f"UDP port 8890 of {addresses.pilot} is in use" in sink.links[-1][1]
+            assert f"UDP port 8890 on {addresses.pilot} is in use" in sink.links[-1][1]
             other.close()
             up(sink)
 

@@ -147,7 +147,7 @@ class ArdroneSession(VehicleSession):
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_navdata(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the navdata port. Never raises, whatever the content."""
+        """Handle a datagram from the navdata port. Never raises, regardless of content."""
         navdata = self.reception.receive(datagram, now_ns)
         if navdata is None:
             return

@@ -113,7 +113,7 @@ class PaveAssembly:
         return self._parser.skipped_bytes
 
     def feed(self, data: bytes, now_ns: int) -> list[Coded]:
-        """Return the frames that these bytes complete. Never raises, whatever the content."""
+        """Return the frames that these bytes complete. Never raises, regardless of content."""
         return [coded for frame in self._parser.feed(data) for coded in self._greet(frame, self._coded(frame, now_ns))]
 
     def end(self) -> None:

@@ -226,7 +226,7 @@ class TelloSession(VehicleSession):
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_state(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the state port. Never raises, whatever the content."""
+        """Handle a datagram from the state port. Never raises, regardless of content."""
         try:
             state = parse(datagram)
         except DecodeError:
@@ -255,7 +255,7 @@ class TelloSession(VehicleSession):
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the command port. Never raises, whatever the content."""
+        """Handle a datagram from the command port. Never raises, regardless of content."""
         reply = decoded(datagram)
         if not reply:
             self.counts["damaged"] += 1

@@ -273,7 +273,7 @@ def pieces(picture: bytes) -> list[bytes]:
 
 
 class Assembly:
-    """Assembles images from pieces in order of arrival. Never raises, whatever the input.
+    """Assembles images from pieces in order of arrival. Never raises, regardless of input.
 
     ``stray`` counts bytes that don't belong to any image, ``missing`` counts images missing from the stream's numbers.
     """

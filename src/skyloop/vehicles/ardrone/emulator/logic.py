@@ -134,7 +134,7 @@ class ArdroneLogic:
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Execute the commands in a datagram. Never raises, whatever the content."""
+        """Execute the commands in a datagram. Never raises, regardless of content."""
         commands, malformed = parse_commands(datagram)
         self.malformed += malformed
         for command in commands:

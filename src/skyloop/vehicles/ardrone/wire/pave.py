@@ -132,7 +132,7 @@ class PaveParser:
         return len(self._buffer)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[PaveFrame]:
-        """Add bytes from the stream; return the frames that they complete. Never raises, whatever the input."""
+        """Add bytes from the stream; return the frames that they complete. Never raises, regardless of input."""
         self._buffer += data
         frames: list[PaveFrame] = []
         while (header := self._header or self._find_header()) is not None:

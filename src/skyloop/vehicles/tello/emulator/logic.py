@@ -238,7 +238,7 @@ class TelloLogic:
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes, sender: Address) -> None:
-        """Execute a command and reply to it. Never raises, whatever the content."""
+        """Execute a command and reply to it. Never raises, regardless of content."""
         text = decoded(datagram)
         if not text or (self.client is None and text != ENTER):
             self.unknown += 1
