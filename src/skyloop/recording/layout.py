@@ -53,7 +53,7 @@ WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
 # Times ---------------------------------------------------------------------------------------------------------
 
 
-_LAST_UNIX_NS: Final = 2**63 - 1  #: in the year 2262
+_LAST_UNIX_NS: Final = 2**63 - 1  #: largest 64-bit time, in the year 2262
 
 
 class ClockPair(msgspec.Struct, frozen=True):
@@ -173,7 +173,7 @@ class FrameRecord(msgspec.Struct, frozen=True):
     The image is on the topic given by :func:`image_topic` or, for H.264, by :func:`video_topic`.
     """
 
-    header: FrameHeader  #: as received
+    header: FrameHeader  #: header as received
     received_ns: int  #: on the recorder's monotonic clock
     format: str  #: the image's format in the file: ``jpeg``, ``png``, ``h264``
     key: bool = True  #: whether it can be decoded on its own; false only for some ``h264`` frames

@@ -315,7 +315,7 @@ def reported_ns(value: Any) -> int | None:
         return value.at_ns
     if isinstance(value, Annotation):
         return value.captured_ns
-    made_ns = getattr(value, "made_ns", None)  # from a result's record
+    made_ns = getattr(value, "made_ns", None)  # found in a result's record
     if made_ns is not None:
         return int(made_ns)
     header = getattr(value, "header", None)  # found in a frame's record or picture

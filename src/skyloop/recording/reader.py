@@ -369,7 +369,7 @@ class Described(msgspec.Struct, frozen=True):
 
     started: float | None = None  #: Unix time [s]; None if unknown
     drones: tuple[str, ...] = ()
-    seconds: float | None = None  #: from the first message to the last
+    seconds: float | None = None  #: time from the first message to the last
     problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
 
 

@@ -413,7 +413,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # with too much content, what gets skipped depends on the order, so a scan is needed
+    return not found.damaged  # if content is skipped for its size, the order matters, so a scan is needed
 
 
 def _header_end(file: IO[bytes]) -> int:

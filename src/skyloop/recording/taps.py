@@ -38,7 +38,7 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # in addition to one being encoded and one arriving: a client can't hold more frame slots
+_FRAMES_WAITING: Final = 2  # besides one being encoded and one arriving; a client can't hold more frame slots
 _SIZE: Final = 400  #: approximate size of an ordinary sample [bytes]
 _STREAM_GONE_NS: Final = nanoseconds(2.0)  # if no frame of the stream arrives for this long, record decoded frames
 _PARAMETERS_S: Final = 2.0  # pause before trying again to read parameters

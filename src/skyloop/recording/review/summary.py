@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mcap.writer import Writer
 
 GAP_FACTOR: Final = 3.0  #: a step between two messages counts as a gap if it is longer than this many typical steps
-MIN_STEPS: Final = 5  #: with fewer steps, the typical step is unknown
+MIN_STEPS: Final = 5  #: number of steps needed to determine the typical step
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, reported: str) -> bool:
-    """Return whether the drone reports the written value, whatever its number format."""
+    """Return whether the drone reports the written value, regardless of its number format."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:

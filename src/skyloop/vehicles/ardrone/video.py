@@ -53,7 +53,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone sends one at a time. Intrinsics in the address apply to the front one."""
+    """Return both cameras; the drone sends one at a time. Intrinsics in the address apply to the front one."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)

@@ -201,7 +201,7 @@ class ReplayPublisher:
         self._playback = playback
         self._first_ns = first_ns
         self._link = LinkState.CONNECTING
-        self._newest_ns: dict[str, int] = {}  # by camera; capture times never go backwards, not even between passes
+        self._newest_ns: dict[str, int] = {}  # newest capture time by camera, which never goes backwards
         self._command: dict[str, Value] = {}
 
     def link(self, state: LinkState, reason: str = "") -> None:

@@ -147,7 +147,7 @@ class ReplaySource:
             return []
         passed_ns = last.value.published_ns - first.value.published_ns
         if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
-            return []  # to avoid reading the whole file
+            return []  # avoids reading the whole file
         found, course = [], Course()
         for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
             before_ns = course.shift_ns

@@ -180,7 +180,7 @@ PAD_LOST: Final = 5  #: number of consecutive states without a pad after which i
 
 
 class Health:
-    """Reports each time that overheating or the visible mission pad changes."""
+    """Reports changes in overheating and in the visible mission pad, each once."""
 
     def __init__(self) -> None:
         self._hot = False

@@ -54,7 +54,7 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone sends one at a time; the downward one needs SDK 3.0.
+    """Return both cameras. The drone sends one at a time; the downward one needs SDK 3.0.
 
     Intrinsics in the address apply to the front camera.
     """

@@ -38,7 +38,7 @@ MAX_STICK: Final = 100
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: in characters; all commands and replies in the SDK are much shorter
+MAX_COMMAND: Final = 256  #: length in characters; all commands and replies in the SDK are much shorter
 
 
 class Sdk(StrEnum):
@@ -168,7 +168,7 @@ class State:
     distance_cm: float | None = None  #: ``tof``: distance to the surface below
     height_cm: float | None = None  #: height above the take-off point; may be negative
     battery_percent: float | None = None
-    barometer: float | None = None  #: as sent; the zero point and unit differ between versions
+    barometer: float | None = None  #: reading as sent; its zero point and unit differ between versions
     motor_s: int | None = None  #: total running time of the motors since the drone was switched on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None

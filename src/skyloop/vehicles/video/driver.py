@@ -183,7 +183,7 @@ class DeviceOptions:
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
-    gain: int | str = ""  #: in the device's own unit, or ``auto``
+    gain: int | str = ""  #: gain in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
         """Set exposure and gain; return a readable text for each failure."""

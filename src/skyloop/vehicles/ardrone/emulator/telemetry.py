@@ -44,7 +44,7 @@ class Snapshot:
     believed: VehicleFeedback
     state: FlightState
     time: int  #: see :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time`
-    thrust: float = 0.0  #: as a multiple of the weight
+    thrust: float = 0.0  #: multiple of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that are reported as level
     progress: Progress = NO_PROGRESS

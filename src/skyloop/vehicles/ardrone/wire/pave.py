@@ -18,7 +18,7 @@ SIGNATURE: Final = b"PaVE"
 MIN_HEADER: Final = 64
 MAX_HEADER: Final = 128
 MAX_SIDE: Final = 4096
-DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: in bytes; the drone's 720p key frames are smaller than 100 kB
+DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: size in bytes; the drone's 720p key frames are smaller than 100 kB
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and including advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1

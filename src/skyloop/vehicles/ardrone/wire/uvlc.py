@@ -220,7 +220,7 @@ class BlockWalker:
         self._steps = self._table.step[windows].data
         self._visits: list[int] = []  # positions of the windows with whole pairs, and of the long pairs [bits]
         self._ends: list[int] = []  # number of entries in ``_visits`` at the end of each block
-        self._long: list[tuple[int, int, int]] = []  # for each pair longer than a window: visit, run + 1 and level
+        self._long: list[tuple[int, int, int]] = []  # visit, run + 1 and level of each pair longer than a window
 
     def walk(self, at: int) -> int:
         """Read the next block's pairs from bit ``at`` to the end of the block; return the position of the bit after it.
