@@ -49,7 +49,7 @@ __all__ = [
     "PosesInFrame",
 ]
 
-LINE_WIDTH: Final = 2.0  # pixels
+LINE_WIDTH: Final = 2.0  # width in pixels
 FONT_SIZE: Final = 14.0
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 

@@ -43,10 +43,10 @@ PROTOBUF: Final = "protobuf"  #: both message and schema encoding of messages fo
 # Names of the metadata records. All their values are strings; see :class:`ClockPair` and :class:`Start`.
 META_CLOCK: Final = "skyloop.clock"
 META_RECORDING: Final = "skyloop.recording"
-META_END: Final = "skyloop.end"  #: absent if the file was not closed
+META_END: Final = "skyloop.end"  #: name of the metadata at the end, absent if the file was not closed
 
-LOG: Final = "/log"  #: foxglove.Log for all drones: events and log text
-TF: Final = "/tf"  #: foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
+LOG: Final = "/log"  #: topic of foxglove.Log for all drones: events and log text
+TF: Final = "/tf"  #: topic of foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
 WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
 
 

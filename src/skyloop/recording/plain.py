@@ -298,8 +298,8 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 # own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is earlier than the newest one by more than this
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this after the newest one
+_BACK_NS: Final = 10 * NS_PER_S  #: limit for how far a sample's own time may lie before the newest one
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: limit for how far it may lie after it
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")

@@ -45,7 +45,7 @@ FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
 #: Head of a chunk: first and last time, uncompressed size and CRC, length of the compression's name.
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
-_LONGEST: Final = 1 << 32  #: a record longer than this counts as damage
+_LONGEST: Final = 1 << 32  #: maximum length of a record; a longer one counts as damage
 MAX_NAME: Final = 16  #: maximum length of a compression's name [bytes]
 
 #: Exceptions that reading a damaged record may raise.

@@ -38,9 +38,9 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # besides one being encoded and one arriving; a client can't hold more frame slots
+_FRAMES_WAITING: Final = 2  # frames besides one being encoded and one arriving; a client can't hold more frame slots
 _SIZE: Final = 400  #: approximate size of an ordinary sample [bytes]
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # if no frame of the stream arrives for this long, record decoded frames
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # time without a frame of the stream after which decoded frames are recorded
 _PARAMETERS_S: Final = 2.0  # pause before trying again to read parameters
 
 _log = logging.getLogger(__name__)

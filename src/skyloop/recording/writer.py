@@ -26,13 +26,13 @@ from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
 from skyloop.recording.translation import Message, Picture, Schema, Translator
 
-CHUNK: Final = MB  #: a chunk is closed after this many bytes, or earlier by :meth:`RecordingFile.commit`
+CHUNK: Final = MB  #: size at which a chunk is closed, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
-_COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
+_COMMIT_NS: Final = nanoseconds(0.5)  #: time within which samples reach the file, unless the disk is too slow
 _REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that was full
 #: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
-_SILENCE_NS: Final = nanoseconds(2.0)  #: if no H.264 arrives for this long, a full file does not wait for a key frame
+_SILENCE_NS: Final = nanoseconds(2.0)  #: time without H.264 after which a full file does not wait for a key frame
 _LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk, and between attempts to resume writing
 
 Tell = Callable[[str, Severity], None]

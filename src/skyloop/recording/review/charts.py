@@ -23,8 +23,8 @@ LEFT: Final = 64  #: left margin for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
 AXIS: Final = 20  #: margin for the labels of the time axis
-BUCKETS: Final = 700  #: a line has at most twice this many points: the minimum and maximum in each bucket
-GAP_FACTOR: Final = 8.0  #: a step longer than this many typical ones leaves a gap in the line
+BUCKETS: Final = 700  #: number of buckets of a line, each drawn as its minimum and maximum
+GAP_FACTOR: Final = 8.0  #: minimum length of a gap in a line, as a multiple of the typical step
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ MARK: Final = "mark"  #: name of a logged text that starts a new episode and nam
 TAUGHT: Final = "action"  #: name of logged arrays that hold the demonstrated action for an image
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
-_GAP_S: Final = 0.5  #: an episode ends if no image or no state arrives for this long
-_SHORTEST_S: Final = 1.0  # shorter episodes are left out
+_GAP_S: Final = 0.5  #: time without an image or state after which an episode ends
+_SHORTEST_S: Final = 1.0  # minimum duration of an episode; shorter ones are skipped
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -220,8 +220,8 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 
 
 _KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in any order
-_LOOKED_AT_EVERY: Final = 16  #: one in this many rows is sampled for the statistics
-_THINNED: Final = 4  #: only every fourth row and column of a sampled image is used
+_LOOKED_AT_EVERY: Final = 16  #: number of rows of which one is sampled for the statistics
+_THINNED: Final = 4  #: spacing of the rows and columns used from a sampled image
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 Pixels = NDArray[np.uint8]

@@ -38,12 +38,12 @@ _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
 _MOST_EVENTS: Final = 500  # maximum number of events listed on the page
-_LONGEST_STEP_S: Final = 0.5  #: velocity is not integrated across a longer step
+_LONGEST_STEP_S: Final = 0.5  #: longest step across which velocity is integrated
 _WIDTH: Final = 360  #: width of a thumbnail [px]
 _QUALITY: Final = 80  # JPEG quality of thumbnails
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: fraction of the usual spacing: skip an evenly spaced frame that is this close to one at an event
-_SAME_CLOCK_S: Final = 60.0  #: skip longer delays, because the two clocks must be unrelated
+_NEAR: Final = 0.4  #: fraction of the usual spacing; an evenly spaced frame this close to one at an event is skipped
+_SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer ones are skipped, because the two clocks must be unrelated
 
 
 def write_report(

@@ -20,7 +20,7 @@ from skyloop.recording.scan import Message, Scan, Schema, attachments, open_file
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-GAP_FACTOR: Final = 3.0  #: a step between two messages counts as a gap if it is longer than this many typical steps
+GAP_FACTOR: Final = 3.0  #: minimum length of a gap between two messages, as a multiple of the typical step
 MIN_STEPS: Final = 5  #: number of steps needed to determine the typical step
 
 

@@ -59,12 +59,12 @@ HURRY_NS: Final = nanoseconds(
 )  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
 DEGRADED_NS: Final = nanoseconds(0.25)  #: time without data after which the link is DEGRADED
 LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing within this time is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
 SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
-SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after this the link is DEGRADED and the drone may fly without set-up
-DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone is ignoring our commands
-REPEATS: Final = 3  #: how many times an unacknowledged command is sent
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: time until the link is DEGRADED and the drone may fly without set-up
+DEAF_NS: Final = nanoseconds(1.0)  #: time after which a set watchdog bit means that the drone ignores our commands
+REPEATS: Final = 3  #: number of times an unacknowledged command is sent
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
 
 _WATCHDOG: Final[AtMessage] = ("COMWDG", ())

@@ -105,8 +105,8 @@ def _share(value: float, limit: float) -> float:
     return clamped(value / limit, 1.0) + 0.0  # avoids a negative zero
 
 
-TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone not in the air after this long is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after we sent a take-off is ours, not another program's
+TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still on the ground is refusing to take off
+RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which a rise is ours, not another program's
 #: Navdata shows the effect of the emergency bit within this time, whether by the drone's clock or by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 

@@ -37,7 +37,7 @@ from skyloop.vehicles.ardrone.wire.navdata import (
 
 #: Period of the drone's datagrams in demo mode (True, as before its set-up) and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
-RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: a lower number after this long means a restart, not a late datagram
+RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: gap after which a lower number means a restart, not a late datagram
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
 

@@ -141,7 +141,7 @@ class PaveAssembly:
 
 CONNECT_S: Final = 1.0  #: connection timeout
 POLL_S: Final = 0.1  #: maximum time that a read blocks
-SILENT_S: Final = 3.0  #: the connection is closed if no complete frame arrives for this long
+SILENT_S: Final = 3.0  #: time without a complete frame after which the connection is closed
 KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
 WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1: any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
@@ -230,8 +230,8 @@ def _give_up_if_silent(silent_ns: int) -> None:
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: a number lower by more than this means that the drone restarted, not that the image is late
-OLD_RUN: Final = 4  #: this many consecutive images older than the newest also mean that the drone restarted
+REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger one means a restart
+OLD_RUN: Final = 4  #: number of consecutive images older than the newest that also means a restart
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 

@@ -120,7 +120,7 @@ class Loop:
 Address = tuple[str, int]
 
 MAX_DATAGRAM: Final = 65_507
-_MOST_AT_ONCE: Final = 64  # datagrams read before other callbacks run
+_MOST_AT_ONCE: Final = 64  # number of datagrams read before other callbacks run
 _SEND_BUFFER: Final = 1 << 20  # size in bytes; large enough for an AR.Drone 1's images
 
 

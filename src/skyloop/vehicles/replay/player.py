@@ -36,7 +36,7 @@ from skyloop.vehicles.replay.source import Moment, ReplaySource, TimedSample, Ti
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"
 PAUSED: Final = "replay.paused"
-SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in recorded seconds per second
+SPEEDS: Final = (0.01, 1000.0)  #: minimum and maximum speed, in recorded seconds per second
 NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
 
 _IN_STEP: Final = (
@@ -348,7 +348,7 @@ HEARTBEAT_NS: Final = 50_000_000  #: time between repeats of the first state whi
 PAUSE_NS: Final = 50_000_000  #: pause between two passes, on the replay's clock
 STILL_NS: Final = 200_000_000  #: time between repeats of the moment shown while paused
 IDLE_S: Final = 3600.0  #: time-out of a wait that normally ends only with a change
-LATE_NS: Final = 250_000_000  #: if further behind than this, postpone the schedule instead of rushing through it
+LATE_NS: Final = 250_000_000  #: lag beyond which the schedule is postponed instead of rushed through
 
 
 class Player:

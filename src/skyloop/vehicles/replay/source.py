@@ -20,7 +20,7 @@ from skyloop.recording.reader import Item, Recording
 #: Channels that are replayed. Annotations and logs are not replayed, because applications create new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
-_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance equally to within this tolerance were not reset
+_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: tolerance within which two clocks that were not reset advance equally
 Sample = Feedback | Picture | Event | Applied | Parameter
 
 
@@ -52,7 +52,7 @@ class Moment:
 #: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
 #: has an image. A camera with no image in them shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
-_KEPT_STATES: Final = 500  #: states to keep from before the time sought, to find the one that matches the images
+_KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
 
 
 class ReplaySource:

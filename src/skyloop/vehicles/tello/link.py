@@ -15,7 +15,7 @@ from skyloop.messages import AnyAction
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 
-_BUFFER: Final = 1 << 20  # half a second of video
+_BUFFER: Final = 1 << 20  # size that holds half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
@@ -59,7 +59,7 @@ def _through(options: TelloOptions) -> socket.socket:
     return made
 
 
-ASK_S: Final = 0.95  #: a command that gets no reply within this time fails
+ASK_S: Final = 0.95  #: time within which a command must get a reply
 
 
 class TelloLink(VehicleLink[TelloSession]):

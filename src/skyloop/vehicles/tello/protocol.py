@@ -26,7 +26,7 @@ from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
 from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: time allowed for a reply; real drones take at most 29 ms over a good link
-TRIES: Final = 3  #: how many times a request is sent before it fails
+TRIES: Final = 3  #: number of times a request is sent before it fails
 MOTION_NS: Final = nanoseconds(20.0)  #: time allowed for the reply to a take-off or landing
 
 #: Called with the reply, or None if there was none.
@@ -126,12 +126,12 @@ TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
 DEGRADED_NS: Final = nanoseconds(0.6)  #: time without state after which the link is DEGRADED; it arrives at 10 Hz
 LOST_NS: Final = nanoseconds(1.5)  #: time without state after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing within this time is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
 ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without commands lands; it begins to after 15 s
 ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
-DEAF: Final = 2  #: consecutive unanswered requests that mean our commands are not being received
+DEAF: Final = 2  #: number of consecutive unanswered requests that means our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
 ALIVE: Final = "wifi?"
 DEFAULT_HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point

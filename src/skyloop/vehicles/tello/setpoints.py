@@ -84,9 +84,9 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
-AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that has no visible effect within this time is repeated
-TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone not in the air after this long is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: a take-off may begin up to this long after it was sent; real drones take 1.1 s
+AGAIN_NS: Final = nanoseconds(1.5)  #: time after which a take-off or landing without visible effect is repeated
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: time after which a drone still on the ground is refusing to take off
+RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which it may begin; real drones take 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 

@@ -85,10 +85,10 @@ def _angle(degrees: float | None) -> float | None:
 
 # The phase of flight -------------------------------------------------------------------------------------------------
 
-STILL_NS: Final = nanoseconds(1.6)  #: the motors are off if the count of seconds stops increasing for this long
-GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or has not begun yet
-LOW_M: Final = 0.15  #: heights up to this are near the ground
-HIGH_M: Final = 0.25  #: at this height and above, the drone is off the ground
+STILL_NS: Final = nanoseconds(1.6)  #: time without an increase in the count of seconds after which the motors are off
+GRACE_NS: Final = nanoseconds(2.5)  #: time to wait for a count that has just stopped or has not begun yet
+LOW_M: Final = 0.15  #: maximum height that counts as near the ground
+HIGH_M: Final = 0.25  #: minimum height that counts as off the ground
 HOVER_M: Final = 0.4  #: minimum height at the end of a take-off
 SLOW_DM_S: Final = 1.0  #: maximum vertical speed at the end of a take-off
 SETTLED: Final = 3  #: number of consecutive high and slow samples that end a take-off
@@ -174,8 +174,8 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: an estimate: users report that the drone refuses to start its motors somewhat above this
-COOL_C: Final = 85.0  #: a hot drone no longer counts as hot below this
+HOT_C: Final = 90.0  #: estimated limit: users report that the drone refuses to start its motors somewhat above this
+COOL_C: Final = 85.0  #: temperature below which a hot drone no longer counts as hot
 PAD_LOST: Final = 5  #: number of consecutive states without a pad after which it counts as out of view
 
 

@@ -84,7 +84,7 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
 POLL_S: Final = 0.1  #: maximum time that a read blocks
-SILENT_S: Final = 3.0  #: the port is reopened if no datagram arrives for this long
+SILENT_S: Final = 3.0  #: time without a datagram after which the port is reopened
 BURST: Final = 64  #: maximum number of datagrams per read
 
 

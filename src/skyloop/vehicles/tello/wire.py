@@ -30,7 +30,7 @@ PORT: Final = 8889  #: the Tello's port for commands; it replies to the sender's
 STATE_PORT: Final = 8890  #: the client's port for state
 VIDEO_PORT: Final = 11111  #: the client's port for video
 HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
-SILENCE_S: Final = 15.0  #: the Tello lands after this time without a command
+SILENCE_S: Final = 15.0  #: time without a command after which the Tello lands
 
 ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FFmpegError = av.error.FFmpegError
 
 CHUNK: Final = 1 << 16  #: number of bytes per read
-SNIFF: Final = 1 << 18  #: a PaVE stream has a header within this many bytes, wherever it was cut
+SNIFF: Final = 1 << 18  #: number of bytes within which a PaVE stream has a header, wherever it was cut
 DEFAULT_FPS: Final = 30.0  #: frame rate if the file does not specify it
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
@@ -194,8 +194,8 @@ Source = ContainerSource | PaveSource
 
 FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
 POLL_S: Final = 0.02  #: time between checks for a viewer
-BEHIND_NS: Final = 250_000_000  #: if further behind than this, restart the schedule instead of rushing to catch up
-GAP_S: Final = 2.0  #: a step between stamps that is longer than this, or backwards, is a cut in the recording
+BEHIND_NS: Final = 250_000_000  #: lag beyond which the schedule restarts instead of rushing to catch up
+GAP_S: Final = 2.0  #: maximum step between stamps; a longer one, or a step back, is a cut in the recording
 
 
 class FilePacer:

@@ -25,7 +25,7 @@ from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
-TAKEOFF_ALTITUDE_M: Final = 0.85  #: real drones hover at 0.7 to 1 m after a take-off
+TAKEOFF_ALTITUDE_M: Final = 0.85  #: height after a take-off; real drones hover at 0.7 to 1 m
 _LEAST_TURNING_SPEED_M_S: Final = 1.0  # minimum speed with which to compute a coordinated turn
 _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
@@ -94,7 +94,7 @@ def _possible(name: str, value: float) -> float:
 HOVER_AFTER_S: Final = 0.25  #: time without commands before it hovers: general:com_watchdog in the guide (unverified)
 LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
-BATTERY_RECOVERY_MV: Final = 500  #: how far above vbat_min a battery no longer counts as low; an estimate
+BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no longer counts as low; an estimate
 CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn in about 4 s; an estimate
 FIRST_FLIP: Final = 16
 LAST_ANIMATION: Final = 19

@@ -18,7 +18,7 @@ from skyloop.errors import UsageError
 
 PORT: Final = 5556
 MAX_LINE: Final = 1024  #: maximum length of a line [characters]; the drone drops longer ones
-SILENCE_RESET_S: Final = 2.0  #: after this long without commands the drone expects the sequence to restart at 1
+SILENCE_RESET_S: Final = 2.0  #: time without commands after which the drone expects the sequence to restart at 1
 
 Argument: TypeAlias = int | float | str
 #: A command's name, and the arguments that follow its sequence number.

@@ -65,7 +65,7 @@ from skyloop.errors import DecodeError
 START_CODE_BITS: Final = 22
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this plus k
 P264_START: Final = 0x40  #: start code of the drone's other codec
-END_OF_PICTURE: Final = 0x3F  #: marks the end where group 31 would start
+END_OF_PICTURE: Final = 0x3F  #: code that marks the end where group 31 would start
 MAX_GROUPS: Final = 31
 
 FORMAT_BITS: Final = 2
@@ -75,7 +75,7 @@ QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
-BLOCKS: Final = 6  #: blocks in a macroblock: four for luma in reading order, then Cb and Cr at half resolution
+BLOCKS: Final = 6  #: blocks per macroblock: four for luma in reading order, then Cb and Cr at half resolution
 SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
 DC_BITS: Final = 10
@@ -141,10 +141,10 @@ INVERSE_TRANSFORM: Final = _inverse_transform()
 
 # Run and level codes -------------------------------------------------------------------------------------------------
 
-WINDOW: Final = 16  #: bits per table lookup
-PADDING: Final = 32  #: zero bytes appended to the packet, so that no lookup goes past the end
+WINDOW: Final = 16  #: number of bits per table lookup
+PADDING: Final = 32  #: number of zero bytes appended to the packet, so that no lookup goes past the end
 _PAIRS: Final = 5  #: maximum number of whole pairs in a window; the shortest pair takes 3 bits
-_MAX_LEVEL_ZEROS: Final = 11  #: allows levels below 2048; pictures of 8-bit samples have none greater
+_MAX_LEVEL_ZEROS: Final = 11  #: limit that allows levels below 2048; pictures of 8-bit samples have none greater
 
 Ints = NDArray[np.int64]
 
@@ -290,7 +290,7 @@ class BlockWalker:
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 MAX_PACKET: Final = 65_535  #: maximum size of a picture, which is one datagram [bytes]
-_MAX_TAIL_BITS: Final = 64  # zeros that pad the last word after the end of the picture
+_MAX_TAIL_BITS: Final = 64  # number of zero bits after the end of the picture that are too many for padding
 # Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
 # also be rounded up by half a step.
 _MAX_DC: Final = 2048

@@ -114,7 +114,7 @@ class Settings:
 
 STATE_HZ: Final = 10.0
 GROUP: Final = 30  #: number of images from one key frame to the next
-FULL_KBPS: Final = 2500  #: makes images of about 10 kB
+FULL_KBPS: Final = 2500  #: bitrate that makes images of about 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
 

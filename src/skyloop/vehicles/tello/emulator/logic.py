@@ -38,14 +38,14 @@ from skyloop.vehicles.tello.wire import (
 
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
-RISES_WITHIN_S: Final = 0.5  #: if it has not risen within this simulated time, take-off was refused for a low battery
+RISES_WITHIN_S: Final = 0.5  #: simulated time without rising after which take-off was refused for a low battery
 TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although the drone hovered long before
 FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
-PATIENCE_S: Final = 30.0  #: a command that takes longer than this fails
-_NEAR_M: Final = 0.06  # a move ends within this distance …
-_SLOW_M_S: Final = 0.12  # … and below this speed
-_NEAR_RAD: Final = 0.03  # a turn ends within this angle
+PATIENCE_S: Final = 30.0  #: time after which an unfinished command fails
+_NEAR_M: Final = 0.06  # maximum distance at which a move ends …
+_SLOW_M_S: Final = 0.12  # … and the maximum speed
+_NEAR_RAD: Final = 0.03  # maximum angle at which a turn ends
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 #: The vehicle's next command, and the reply if the running command has ended.
@@ -143,7 +143,7 @@ Range = tuple[int, int]
 _MOVE: Final[tuple[Range, ...]] = ((20, 500),)
 _SPEED: Final[Range] = (10, 100)
 _PLACE: Final[tuple[Range, ...]] = ((-500, 500),) * 3
-_LEAST_CM: Final = 20  # at least one coordinate of a target must have this magnitude
+_LEAST_CM: Final = 20  # magnitude that at least one coordinate of a target must have
 
 MOVES: Final = {
     "up": (0, 0, 1),
