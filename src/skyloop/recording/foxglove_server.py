@@ -174,7 +174,7 @@ class FoxgloveServer:
 
     def _send(self, message: Message) -> None:
         channel = self._channels.get(message.topic)
-        if channel is None:  # images in an unexpected format
+        if channel is None:  # the images have an unexpected format
             known = self._known.get(message.topic)
             if known is None:
                 return
@@ -473,7 +473,7 @@ class OriginGuard:
         #: address and port of the server behind it; set before the port is announced
         self.behind: tuple[str, int] = ("", 0)
         self._server = Server((host, port), Visitor)
-        self.port = int(self._server.server_address[1])  #: the port it listens on
+        self.port = int(self._server.server_address[1])  #: port that it listens on
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
         )

@@ -174,7 +174,7 @@ class FrameRecord(msgspec.Struct, frozen=True):
     """
 
     header: FrameHeader  #: header as received
-    received_ns: int  #: on the recorder's monotonic clock
+    received_ns: int  #: time of reception on the recorder's monotonic clock
     format: str  #: the image's format in the file: ``jpeg``, ``png``, ``h264``
     key: bool = True  #: whether it can be decoded on its own; false only for some ``h264`` frames
 
@@ -196,9 +196,9 @@ class ResultRecord(msgspec.Struct, frozen=True):
 class Drops(msgspec.Struct, frozen=True):
     """Totals by channel (``feedback``, ``video.front``) since the start of the recording, written after each change."""
 
-    at_ns: int  #: on the recorder's monotonic clock
-    dropped: dict[str, int]  #: received but dropped, because the disk or the encoder was too slow
-    missed: dict[str, int]  #: never received: dropped by the proxy because the recorder was slow, or lost in transport
+    at_ns: int  #: time on the recorder's monotonic clock
+    dropped: dict[str, int]  #: samples received but dropped, because the disk or the encoder was too slow
+    missed: dict[str, int]  #: samples dropped by the proxy because the recorder was slow, or lost in transport
 
 
 #: Message types of Skyloop's own channels.

@@ -304,7 +304,7 @@ class Shown:
 
     name: str
     capabilities: Capabilities
-    unix: Callable[[int], int]  #: converts a time on the drone's proxy's clock to Unix time [ns]
+    unix: Callable[[int], int]  #: function from a time on the proxy's clock to Unix time [ns]
 
 
 class RerunLog:

@@ -216,7 +216,7 @@ class FileWriter:
         self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last such sample
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
-        #: returns the totals of missed samples by drone and channel, for the end of each file
+        #: function that returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
         self.each_second: Callable[[], None] = lambda: None  #: called each second on the writing thread
         self._path = path
@@ -301,7 +301,7 @@ class FileWriter:
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # if paused, try once more; and write the final counts
+        self._look_due_ns = 0  # so that it tries once more if paused, and writes the final counts
         self.step(time.monotonic_ns())
         self._end()
 
@@ -353,7 +353,7 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # before writing, so that nothing is lost if the disk fails in the middle
+        self._uncommitted += batch  # done before writing, so that nothing is lost if the disk fails in the middle
         for item in batch:
             for message in self._messages(item):
                 file.write(message)

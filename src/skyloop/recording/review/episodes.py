@@ -282,7 +282,7 @@ class Film:
             while at < len(wanted) and wanted[at] <= captured_ns:
                 self._encode(image, recording.path)
                 at += 1
-        for _ in wanted[at:]:  # images missing at the end of a truncated file
+        for _ in wanted[at:]:  # the file is truncated: images are missing at its end
             if image is None:
                 raise FileFormatError(f"{recording.path}: no image of {camera} can be decoded")
             self.repeated += 1

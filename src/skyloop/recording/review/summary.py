@@ -186,7 +186,7 @@ class Recovered:
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
     """Read every byte of a recording and describe its problems; return nothing if it is intact."""
     for _ in recording.entries(progress=progress):
-        pass  # reading verifies the checksums
+        pass  # reading is enough: it verifies the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 

@@ -382,7 +382,7 @@ class _File:
             self._shortened += stamp - self._stamp - _LONGEST_STEP
             stamp = self._stamp + _LONGEST_STEP
         packet.pts = packet.dts = self._stamp = stamp
-        packet.duration = _USUAL_STEP  # applies only to the last frame: the others end when the next one starts
+        packet.duration = _USUAL_STEP  # used only for the last frame: the others end when the next one starts
         packet.time_base, packet.stream, packet.is_keyframe = TIME_BASE, self._stream, key
         self._container.mux(packet)
         self.frames += 1

@@ -47,7 +47,7 @@ Step: TypeAlias = Write | Read
 class Exchange:
     """A sequence of steps, and a callback that is called at the end."""
 
-    steps: Iterator[Step]  #: may be a generator: each step is fetched after the previous one has finished
+    steps: Iterator[Step]  #: possibly a generator: each step is fetched after the previous one has finished
     deadline_ns: int  #: deadline for all steps together
     done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with the failure or None
 

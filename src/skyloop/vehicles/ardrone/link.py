@@ -169,7 +169,7 @@ class DumpClient:
         connection.setblocking(False)
         try:
             code = connection.connect_ex((self.address, self._port))
-        except OSError as error:  # no usable address
+        except OSError as error:  # there is no usable address
             connection.close()
             configurator.dump_failed(self._with_port(error.strerror or str(error)))
             return

@@ -33,7 +33,7 @@ class ArdroneOptions:
     host: str
     ports: Ports = navdata.STANDARD
     version: int | None = None  #: the drone's version; None to read it from the configuration
-    full: bool = False  #: navdata at 200 Hz with all options instead of the demo mode
+    full: bool = False  #: whether to request navdata at 200 Hz with all options instead of the demo mode
     navdata_options: int | None = None  #: one bit per tag; None to leave the drone's configuration as it is
     rate_hz: float = 50.0  #: maximum rate of feedback
     video: bool = True

@@ -175,7 +175,7 @@ class SetpointController:
         self._bit = False  # the emergency bit as last sent
         self._bit_due = False  # whether to set the bit next, regardless of navdata
         self._changed_ns = 0  # when the bit last changed or was requested, or an emergency ended
-        self._passed_ns = 0  # the drone's own time from then until the newest navdata
+        self._passed_ns = 0  # drone's own time from then until the newest navdata
         self._received_ns = 0
         self._late_ns = 0  # age of the delayed navdata that arrives in a burst after a gap
         self._warned_blind = False
@@ -344,7 +344,7 @@ class SetpointController:
 
     def _on_bit(self, now_ns: int) -> None:
         self._changed_ns = now_ns
-        self._passed_ns = self._received_ns - now_ns  # minus the age of the newest navdata; more may be on its way
+        self._passed_ns = self._received_ns - now_ns  # negative age of the newest navdata; more may be on its way
 
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)

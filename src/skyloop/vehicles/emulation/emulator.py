@@ -165,7 +165,7 @@ class DatagramPort:
         for _ in range(_MOST_AT_ONCE):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
-            except OSError:  # no more datagrams, or a reply that could not be delivered
+            except OSError:  # there are no more datagrams, or a reply could not be delivered
                 return
             for each, address in self._inward.items((datagram, sender)):
                 self._later(partial(self._on_datagram, each, address))

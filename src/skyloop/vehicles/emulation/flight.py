@@ -195,7 +195,7 @@ class FlightControl:
 
     def _fly(self, action: AnyAction) -> None:
         if not action.finite:
-            action = Hover()  # ignore numbers that are not finite
+            action = Hover()  # numbers that are not finite are ignored
         if self.vehicle.state is FlightState.LANDING:
             self.lift_off()  # this makes the vehicle abort a landing
         if self.airborne:

@@ -31,7 +31,7 @@ class ReplayDriver(Driver):
     """
 
     shared = False
-    parameters_without_authority = NAMES  # they control only the replay, not a flight
+    parameters_without_authority = NAMES  # these control only the replay, not a flight
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)

@@ -88,7 +88,7 @@ class TelloLink(VehicleLink[TelloSession]):
     def _open_sockets(self) -> None:
         options = self.session.options
         with self.lock:
-            self._close_sockets()  # first, because the new socket for state needs the same port
+            self._close_sockets()  # done first, because the new socket for state needs the same port
         address = self._lookup.address(options.host)
         commands = command_socket(options, address)
         local = str(commands.getsockname()[0])

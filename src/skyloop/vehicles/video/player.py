@@ -43,7 +43,7 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: Unit | None = None  #: its encoded form, if that is relayed unchanged
+    coded: Unit | None = None  #: the image as encoded, if that is relayed unchanged
     number: int = 0  #: its number in the stream
     reason: str = ""  #: why this image is not relayed although its stream is
     turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
@@ -65,7 +65,7 @@ def open_file(path: Path) -> Source:
         with path.open("rb") as file:
             head = file.read(SNIFF)
     except OSError as error:
-        if "%" in path.name:  # a pattern for a numbered image sequence, which PyAV supports
+        if "%" in path.name:  # this is a pattern for a numbered image sequence, which PyAV supports
             return ContainerSource(str(path))
         raise UsageError(f"video://{path}: {error.strerror}") from error
     if path.suffix == ".pave" or PaveParser().feed(head):
@@ -127,7 +127,7 @@ class ContainerSource:
         try:
             yield from self._container.demux(self._stream)
         except (FFmpegError, OSError, ValueError):
-            self.damaged += 1  # a truncated file, in which everything before the cut is usable
+            self.damaged += 1  # the file is truncated, but everything before the cut is usable
 
     def close(self) -> None:
         self._container.close()

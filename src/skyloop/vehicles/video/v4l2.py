@@ -111,7 +111,7 @@ class V4l2Device:
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         if ioctl is None:
-            from fcntl import ioctl as kernels  # not available on Windows
+            from fcntl import ioctl as kernels  # this module is not available on Windows
 
             ioctl = kernels
         self._descriptor = descriptor

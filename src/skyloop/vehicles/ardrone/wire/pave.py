@@ -70,7 +70,7 @@ class PaveFrame:
 class _Header:
     size: int
     payload_size: int
-    frame: PaveFrame  #: the frame, whose payload is still empty
+    frame: PaveFrame  #: frame whose payload is still empty
 
 
 def build_header(
@@ -178,7 +178,7 @@ class PaveParser:
         while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
             self._searched = inner
             if inner + MIN_HEADER > len(self._buffer):
-                return False  # not enough bytes to tell yet
+                return False  # there are not enough bytes to tell yet
             if _read_header(self._buffer, inner, self.max_payload) is not None:
                 self.broken_frames += 1
                 self._skip(inner)

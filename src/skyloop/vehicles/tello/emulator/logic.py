@@ -232,7 +232,7 @@ class TelloLogic:
         self.looks_for_pads = False
         self.fps = FPS["high"]
         self.size = SIZES["high"]
-        self.bitrate_mbps = 0  #: 0 means that it adapts to the link
+        self.bitrate_mbps = 0  #: bitrate; 0 to adapt to the link
         self.unknown = 0  #: number of datagrams that were not commands
 
     # Receiving -------------------------------------------------------------------------------------------------
@@ -261,7 +261,7 @@ class TelloLogic:
         self._report = report
         if truth.state is FlightState.EMERGENCY:
             self._job = None
-            self._vehicle.command(ResetEmergency())  # takes effect on the ground: a Tello has no emergency state
+            self._vehicle.command(ResetEmergency())  # this takes effect on the ground: a Tello has no emergency state
         if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:

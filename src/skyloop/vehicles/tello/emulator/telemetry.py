@@ -61,7 +61,7 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
     believed = snapshot.report.believed
     yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
     forward, left, up = believed.velocity_m_s
-    ahead, aside = turned(forward, left, yaw_rad)  # relative to the heading when it was switched on
+    ahead, aside = turned(forward, left, yaw_rad)  # velocity relative to the heading at power-on
     ax, ay, az = (part / GRAVITY_M_S2 * 1000 for part in believed.acceleration_m_s2)
     altitude_cm = believed.altitude_m * 100
     steep = math.cos(believed.roll_rad) * math.cos(believed.pitch_rad)
