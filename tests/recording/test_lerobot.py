@@ -170,7 +170,7 @@ def test_unusable_recordings_are_refused(tmp_path: Path, recording: Path) -> Non
         export_lerobot([Recording.open(write_flight(tmp_path / "short.mcap", Plan(seconds=1.5)))], tmp_path / "a")
     with pytest.raises(UsageError, match="no recording was given"):
         export_lerobot([], tmp_path / "a")
-    with pytest.raises(UsageError, match=r"placed.mcap: .*by position"):
+    with pytest.raises(UsageError, match=r"placed.mcap: .*used position"):
         export_lerobot([Recording.open(recording), Recording.open(placed)], tmp_path / "a")
     assert not (tmp_path / "a").exists(), "nothing is left behind"
     (tmp_path / "full").mkdir()

@@ -333,7 +333,7 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
         if at + FRAME.size > size:
             return
         if number >= most:
-            raise ValueError(f"more than {most} records in as many bytes; the rest are skipped")
+            raise ValueError(f"more than {most} records in {most} bytes; the rest are skipped")
         opcode, length = FRAME.unpack_from(data, at)
         begin = at + FRAME.size
         at = begin + length
