@@ -115,7 +115,7 @@ def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:
     assert "its name must end in .html or .png" in log("compare", flight, flight, "-o", tmp_path / "x.gif").err
     assert "No such file" in log("compare", flight, tmp_path / "none.mcap").err
     quiet = write_flight(tmp_path / "quiet.mcap", Plan(seconds=0.2, command_ms=0))
-    with pytest.raises(FileFormatError, match=r"quiet\.mcap holds no commands"):
+    with pytest.raises(FileFormatError, match=r"quiet\.mcap contains no commands"):
         compare(Recording.open(flight), Recording.open(quiet))
     with pytest.raises(UnknownNameError, match="drone"):
         compare(Recording.open(flight), Recording.open(flight), drone="beta")

@@ -189,7 +189,7 @@ def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:
         (["--to", "mp4", "--camera", "sideways", "-o", tmp_path / "x.mp4"], "known: front"),
         (["--to", "mp4", "--channel", "feedback"], "--channel has no effect on mp4"),
         (["--burn-time"], "--burn-time has no effect on csv"),
-        (["--channel", "annotations"], "holds none of these channels"),
+        (["--channel", "annotations"], "contains none of these channels"),
         (["-o", "/proc/nothing/here"], "can't be created"),
         (["--to", "xlsx"], "--to"),
     ):
@@ -211,7 +211,7 @@ def test_unwritable_paths_are_refused(flight: Path, tmp_path: Path) -> None:
         export_npz(found, tmp_path / "x")
     with pytest.raises(UsageError, match="can't be written: No such file"):
         export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "nowhere" / "x.mp4")
-    with pytest.raises(FileFormatError, match="holds none"):
+    with pytest.raises(FileFormatError, match="contains none"):
         read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))
 
 

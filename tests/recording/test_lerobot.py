@@ -115,7 +115,7 @@ def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_do_not_cou
     assert not episode.action[25:].any()
     assert episode.action[5].any()
     own = replace(commands, columns={**commands.columns, "app_id": np.zeros(len(commands), np.int64)})
-    with pytest.raises(FileFormatError, match="no set-points of an application"):
+    with pytest.raises(FileFormatError, match="no set-points from an application"):
         form_of({**found, "commands": own}, ["front"], 10.0)
 
 
@@ -157,10 +157,10 @@ def test_unusable_recordings_are_refused(tmp_path: Path, recording: Path) -> Non
     found = read(recording)
     with pytest.raises(FileFormatError, match="no frames of back"):
         form_of(found, ["back"], 10.0)
-    with pytest.raises(FileFormatError, match="channel feedback"):
+    with pytest.raises(FileFormatError, match="feedback channel"):
         form_of({"commands": found["commands"]}, [], 10.0)
     placed = write_flight(tmp_path / "placed.mcap", replace(PLAN, places=True))
-    with pytest.raises(UsageError, match="by position set-points"):
+    with pytest.raises(UsageError, match="used position set-points"):
         form_of(read(placed), [], 10.0)
     with pytest.raises(UsageError, match=r"fps is 0 and must be from 0\.5 to 120"):
         export_lerobot([Recording.open(recording)], tmp_path / "a", fps=0)
@@ -170,7 +170,7 @@ def test_unusable_recordings_are_refused(tmp_path: Path, recording: Path) -> Non
         export_lerobot([Recording.open(write_flight(tmp_path / "short.mcap", Plan(seconds=1.5)))], tmp_path / "a")
     with pytest.raises(UsageError, match="no recording was given"):
         export_lerobot([], tmp_path / "a")
-    with pytest.raises(UsageError, match=r"placed.mcap: .*by position"):
+    with pytest.raises(UsageError, match=r"placed.mcap: .*used position"):
         export_lerobot([Recording.open(recording), Recording.open(placed)], tmp_path / "a")
     assert not (tmp_path / "a").exists(), "nothing is left behind"
     (tmp_path / "full").mkdir()

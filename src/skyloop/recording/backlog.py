@@ -11,11 +11,11 @@ from typing import Any, Final
 
 from skyloop.recording.options import MB
 
-RESERVE: Final = 64 * MB  #: bytes above the limit, reserved for samples that must not be dropped
+RESERVE: Final = 64 * MB  #: additional bytes, reserved for samples that must not be dropped
 
 
 class Rank(IntEnum):
-    """The order of dropping: samples of the highest rank are dropped first."""
+    """The order in which samples are dropped, highest rank first."""
 
     KEPT = 0  #: commands, events, parameters, logs: dropped only if the reserve is full as well
     STATE = 1  #: feedback, annotations
@@ -29,9 +29,9 @@ class Item:
     drone: int  #: the drone's index in the recording
     channel: str  #: the channel's name in the drop counts: ``feedback``, ``video.front`` …
     rank: Rank
-    received_ns: int  #: on this process's monotonic clock
+    received_ns: int  #: time of reception on this process's monotonic clock
     sample: Any
-    size: int  #: bytes, approximately
+    size: int  #: approximate size [bytes]
 
 
 #: Counts by drone and channel.
@@ -42,7 +42,7 @@ class Backlog:
     """A bounded first-in, first-out queue with any number of producers and one consumer."""
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
-        """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` bytes more."""
+        """Limit frames and feedback to ``limit`` bytes; all other samples may use ``reserve`` more bytes."""
         self.dropped: Counts = Counter()  #: counts of dropped items
         self._limit = limit
         self._ceiling = limit + reserve
@@ -100,6 +100,6 @@ class Backlog:
         kept, state, frames = self._queues
         for queue, limit in ((frames, self._limit), (state, self._limit), (kept, self._ceiling)):
             while self._size > limit and queue:
-                _, item = queue.popleft()  # drop the oldest, so that the newer ones stay contiguous
+                _, item = queue.popleft()  # drop the oldest, so that the remaining ones have no gaps
                 self._size -= item.size
                 self.dropped[item.drone, item.channel] += 1

@@ -49,7 +49,7 @@ __all__ = [
     "PosesInFrame",
 ]
 
-LINE_WIDTH: Final = 2.0  # pixels
+LINE_WIDTH: Final = 2.0  # width in pixels
 FONT_SIZE: Final = 14.0
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 
@@ -125,7 +125,7 @@ def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
 def pose(feedback: Feedback) -> Pose | None:
     """Return the vehicle's pose in world axes, or None while its attitude is unknown.
 
-    If the position is unknown, place it above the origin at its altitude, to show at least attitude and height.
+    If the position is unknown, place it above the origin at its altitude, so that at least attitude and height show.
     """
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None

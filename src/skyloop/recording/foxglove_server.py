@@ -38,7 +38,7 @@ from skyloop.recording.taps import Parameters, Source, check_names
 from skyloop.recording.translation import Message, Picture, Schema, Translator
 
 PORT: Final = 8765  #: Foxglove's default
-WAITING: Final = 512  #: messages queued per viewer before its oldest are dropped
+WAITING: Final = 512  #: number of messages queued per viewer before the oldest are dropped
 
 
 class FoxgloveServer:
@@ -64,7 +64,7 @@ class FoxgloveServer:
         if priority is not None and not is_loopback(host):
             raise UsageError(
                 f"parameters can be written only from this machine, but {host} is open to others: Foxglove's "
-                "protocol has no passwords. Leave out --write, or --host and reach it through ssh -L"
+                "protocol has no passwords. Leave out --write, or leave out --host and connect through ssh -L"
             )
         self._sdk = _sdk()
         clock = ClockPair.now()
@@ -81,12 +81,12 @@ class FoxgloveServer:
             for topic in topics(drone.name, drone.capabilities, far=Known(drone).is_far):
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
-        self._chains: dict[str, Chain] = {}  # H.264 sent to viewers so far, by topic
-        self._ready = threading.Event()  # set once self._server exists: viewers may connect earlier
+        self._chains: dict[str, Chain] = {}  # H.264 frames sent to viewers so far, by topic
+        self._ready = threading.Event()  # set once ``self._server`` exists, because viewers may connect before that
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
         self._parameters = ParameterAccess(drones, priority, self._parameter_changed)
-        self._guard: OriginGuard | None = None  # used if parameters can be written: else any web page could connect
+        self._guard: OriginGuard | None = None  # set if parameters can be written; otherwise any web page could connect
         hidden = hidden_host()
         try:
             if priority is not None:
@@ -174,7 +174,7 @@ class FoxgloveServer:
 
     def _send(self, message: Message) -> None:
         channel = self._channels.get(message.topic)
-        if channel is None:  # images in an unexpected format
+        if channel is None:  # the images have an unexpected format
             known = self._known.get(message.topic)
             if known is None:
                 return
@@ -276,7 +276,7 @@ class ViewTopic:
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
-    """Yield a drone's topics; the frames of a ``far`` drone are encoded for the network."""
+    """Yield a drone's topics. ``far`` means that the drone's frames are encoded for the network."""
     for channel, kind in layout.TYPES.items():
         if channel not in _OTHERS:
             yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))
@@ -338,7 +338,7 @@ class ParameterAccess:
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
         self._on_change = on_change
-        self._lock = threading.Lock()  # serialises writes and starting to follow
+        self._lock = threading.Lock()  # serialises writes and the start of following
         self._following: list[tuple[Parameters, Listener[Event]]] = []
 
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
@@ -473,7 +473,7 @@ class OriginGuard:
         #: address and port of the server behind it; set before the port is announced
         self.behind: tuple[str, int] = ("", 0)
         self._server = Server((host, port), Visitor)
-        self.port = int(self._server.server_address[1])  #: the port it listens on
+        self.port = int(self._server.server_address[1])  #: port that it listens on
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
         )

@@ -30,7 +30,7 @@ from skyloop.messages import (
 )
 from skyloop.recording.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 
-__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # from plain, for other modules
+__all__ = ["decode", "encode", "from_plain", "schema", "schema_name", "to_plain"]  # re-exported for other modules
 
 T = TypeVar("T")
 
@@ -43,17 +43,17 @@ PROTOBUF: Final = "protobuf"  #: both message and schema encoding of messages fo
 # Names of the metadata records. All their values are strings; see :class:`ClockPair` and :class:`Start`.
 META_CLOCK: Final = "skyloop.clock"
 META_RECORDING: Final = "skyloop.recording"
-META_END: Final = "skyloop.end"  #: absent if the file was not closed
+META_END: Final = "skyloop.end"  #: name of the metadata at the end, absent if the file was not closed
 
-LOG: Final = "/log"  #: foxglove.Log for all drones: events and log text
-TF: Final = "/tf"  #: foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
+LOG: Final = "/log"  #: topic of foxglove.Log for all drones: events and log text
+TF: Final = "/tf"  #: topic of foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
 WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
 
 
 # Times ---------------------------------------------------------------------------------------------------------
 
 
-_LAST_UNIX_NS: Final = 2**63 - 1  #: in the year 2262
+_LAST_UNIX_NS: Final = 2**63 - 1  #: largest 64-bit time, in the year 2262
 
 
 class ClockPair(msgspec.Struct, frozen=True):
@@ -110,7 +110,7 @@ class Start(msgspec.Struct, frozen=True):
     layout: int
     skyloop: str  #: Skyloop's version
     drones: tuple[DroneRecord, ...]
-    started_unix_ns: int  #: start of the whole recording; equal in all its files
+    started_unix_ns: int  #: start of the whole recording; the same in all its files
     file: int = 1  #: this file's number within the recording, starting at 1
     options: dict[str, Any] = {}  #: recorder options: channels, encoding, quality
 
@@ -173,8 +173,8 @@ class FrameRecord(msgspec.Struct, frozen=True):
     The image is on the topic given by :func:`image_topic` or, for H.264, by :func:`video_topic`.
     """
 
-    header: FrameHeader  #: as received
-    received_ns: int  #: on the recorder's monotonic clock
+    header: FrameHeader  #: header as received
+    received_ns: int  #: time of reception on the recorder's monotonic clock
     format: str  #: the image's format in the file: ``jpeg``, ``png``, ``h264``
     key: bool = True  #: whether it can be decoded on its own; false only for some ``h264`` frames
 
@@ -196,9 +196,9 @@ class ResultRecord(msgspec.Struct, frozen=True):
 class Drops(msgspec.Struct, frozen=True):
     """Totals by channel (``feedback``, ``video.front``) since the start of the recording, written after each change."""
 
-    at_ns: int  #: on the recorder's monotonic clock
-    dropped: dict[str, int]  #: received but dropped, because the disk or the encoder was too slow
-    missed: dict[str, int]  #: never received: dropped by the proxy because the recorder was slow, or lost in transport
+    at_ns: int  #: time on the recorder's monotonic clock
+    dropped: dict[str, int]  #: samples received but dropped, because the disk or the encoder was too slow
+    missed: dict[str, int]  #: samples dropped by the proxy because the recorder was slow, or lost in transport
 
 
 #: Message types of Skyloop's own channels.
@@ -217,7 +217,7 @@ TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """The parts of one of Skyloop's own topics."""
+    """The components of the name of one of Skyloop's own topics."""
 
     drone: str
     channel: Channel
@@ -239,7 +239,7 @@ def parse_topic(topic: str) -> Topic | None:
 
 
 def image_topic(drone: str, camera: str) -> str:
-    """Return the topic of a camera's images, foxglove.CompressedImage."""
+    """Return the topic for a camera's images (foxglove.CompressedImage)."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
 
 

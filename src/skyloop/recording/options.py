@@ -55,7 +55,7 @@ class Options(msgspec.Struct, frozen=True):
         return self.rotate_mb is not None or self.rotate_s is not None
 
     def wants(self, channel: Channel) -> bool:
-        """Return whether a channel that has no camera is recorded."""
+        """Return whether to record a channel that does not belong to a camera."""
         return channel.value in self.channels
 
     def wants_camera(self, camera: str) -> bool:
@@ -105,7 +105,7 @@ def numbered(path: Path, number: int) -> Path:
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to: the file (``.mcap`` by default), or in a folder, one named by drones and time.
+    """Return the path to record to: the file (``.mcap`` by default) or, in a folder, one named after drones and time.
 
     Raise ``UsageError`` if the file already exists, or its folder does not.
     """
@@ -139,12 +139,12 @@ class Status(msgspec.Struct, frozen=True):
 
     state: RecorderState = RecorderState.STARTING
     reason: str = ""  #: why it is paused, has failed or is leaving frames out
-    path: str = ""  #: the current file, or the last one
+    path: str = ""  #: the current file or, if there is none, the last one
     files: tuple[str, ...] = ()  #: all files, oldest first
     seconds: float = 0.0  #: time since the start
-    bytes: int = 0  #: in all files together
+    bytes: int = 0  #: total size of all files
     messages: int = 0
-    waiting: int = 0  #: bytes received but not written yet
+    waiting: int = 0  #: number of bytes received but not yet written
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
     missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel
 
@@ -157,14 +157,14 @@ class RecorderEvent(msgspec.Struct, frozen=True):
 
 
 class Room(StrEnum):
-    """What is still written as the disk fills up."""
+    """The samples that are still written as the disk fills up."""
 
     ALL = "all"
     NO_FRAMES = "no frames"
     NOTHING = "nothing"
 
 
-_MARGIN: Final = 1.25  #: free space required before writing more again, as a multiple of the limit
+_MARGIN: Final = 1.25  #: free space required before writing resumes, as a multiple of the limit
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:

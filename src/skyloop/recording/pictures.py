@@ -38,7 +38,7 @@ class Picture:
     log_ns: int  #: when it was received, Unix time [ns]
     publish_ns: int  #: when it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: for decodable H.264: the frame's group and its index in it
+    group: tuple[Group, int] | None = None  #: the frame's group and its index there, if it is decodable H.264
 
     @property
     def header(self) -> FrameHeader:
@@ -166,7 +166,7 @@ class Group:
         self._units: list[bytes] = []
         self._context: VideoCodecContext | None = None
         self._done = 0  # number of units decoded so far
-        self._image: Any = None  # image of the last one decoded
+        self._image: Any = None  # image decoded last
 
     def __len__(self) -> int:
         """Return the number of frames."""

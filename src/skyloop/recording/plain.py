@@ -1,4 +1,4 @@
-"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, no MCAP library.
+"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, without MCAP.
 
 The keys are the field names of the sample's class. Unknown values are absent, numbers that are not finite are null, and
 an extra key (``action``, ``shape``) distinguishes the members of a union.
@@ -125,7 +125,7 @@ def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
         for one in value.values() if isinstance(value, dict) else value:
             limited(one, depth - 1)
     elif type(value) is int and not MIN_INT <= value <= MAX_INT:
-        raise ValueError("a whole number of more than 64 bits")
+        raise ValueError("a whole number with more than 64 bits")
     return value
 
 
@@ -298,8 +298,8 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 # own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is more than this before the newest one
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this after the newest one
+_BACK_NS: Final = 10 * NS_PER_S  #: limit for how far a sample's own time may lie before the newest one
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: limit for how far it may lie after it
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")
@@ -315,10 +315,10 @@ def reported_ns(value: Any) -> int | None:
         return value.at_ns
     if isinstance(value, Annotation):
         return value.captured_ns
-    made_ns = getattr(value, "made_ns", None)  # from a result's record
+    made_ns = getattr(value, "made_ns", None)  # found in a result's record
     if made_ns is not None:
         return int(made_ns)
-    header = getattr(value, "header", None)  # from a frame's record or picture
+    header = getattr(value, "header", None)  # found in a frame's record or picture
     return None if header is None else int(header.published_ns)
 
 

@@ -63,7 +63,7 @@ class Recording:
     """An MCAP file recorded by Skyloop. Opening it reads the index or, if there is none, scans the file.
 
     Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is.
-    Unreadable parts in the middle are skipped, and ``damaged`` lists them.
+    Unreadable parts in the middle are skipped and listed in :attr:`damaged`.
     """
 
     path: Path
@@ -103,12 +103,12 @@ class Recording:
 
     @property
     def cut(self) -> str:
-        """Why the file is incomplete, in words; empty if it is complete."""
+        """Why the file is incomplete; empty if it is complete."""
         return self.found.cut
 
     @property
     def damaged(self) -> list[str]:
-        """The unreadable parts found so far, in words."""
+        """Descriptions of the unreadable parts found so far."""
         return [*self.found.damaged, *(f"{count} × {what}" for what, count in self._bad.items())]
 
     @property
@@ -195,7 +195,7 @@ class Recording:
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with scan.open_file(self.path) as file:
-            # Several threads feed a recorder: a slightly older message can come later, even in the next piece.
+            # Several threads feed a recorder, so a slightly older message can come later, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
@@ -351,7 +351,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # decoding a picture that has no group raises
+            with suppress(FileFormatError):  # raised when decoding a picture without a group
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 
@@ -369,7 +369,7 @@ class Described(msgspec.Struct, frozen=True):
 
     started: float | None = None  #: Unix time [s]; None if unknown
     drones: tuple[str, ...] = ()
-    seconds: float | None = None  #: from the first message to the last
+    seconds: float | None = None  #: time from the first message to the last
     problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
 
 
@@ -390,5 +390,5 @@ def describe(path: Path) -> Described:
         )
     except SkyloopError as error:
         return Described(problem=str(error).removeprefix(f"{path} ").replace(path.name, shown_name(path)))
-    except Exception as error:  # noqa: BLE001  one file's surprise must not hide the others
+    except Exception as error:  # noqa: BLE001  an unexpected error in one file must not hide the others
         return Described(problem=f"{shown_name(path)} can't be read: {error!r:.300}")

@@ -1,4 +1,4 @@
-"""Implement ``skyloop.record``: record drones, connected or given by name, in this process or in one of its own."""
+"""Implement ``skyloop.record``: record drones, connected or given by name, in this process or a separate one."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """The current file, or the last one."""
+        """The current file or, if there is none, the last one."""
         return Path(self.status.path)
 
     @property
@@ -283,7 +283,7 @@ def record(
 
     Args:
         drones: Connected drones, or names of running proxies.
-        path: A file, or a folder in which a file name is chosen.
+        path: A file, or a folder in which to create a file with a generated name.
         channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
             ``video`` and ``video.CAMERA``; None records everything.
         encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
@@ -292,7 +292,7 @@ def record(
         rotate_mb: Start a new file (``flight-0001.mcap``, …) after this many megabytes, H.264 at the next key frame.
             Each file is self-contained. None never does.
         rotate_s: Start a new file after this many seconds; None never does.
-        min_free_mb: Free space to leave on the disk. No frames are recorded below this, nothing below a quarter of it.
+        min_free_mb: Free space to leave on the disk. Below this, no frames are recorded; below a quarter, nothing.
         buffer_mb: Amount of data held for a slow disk before frames are dropped.
         overwrite: Whether to replace an existing file.
         in_process: Whether to record on threads of this process instead of in a separate one; None uses threads only if
@@ -307,7 +307,7 @@ def record(
     """
     several = [drones] if not isinstance(drones, Iterable) or isinstance(drones, str) else list(drones)
     if not several or not all(isinstance(drone, Drone | str) for drone in several):
-        raise UsageError(f"drones is {drones!r:.80} and must be a drone, a proxy's name, or several of them")
+        raise UsageError(f"drones must be a drone, a proxy's name, or several of them, got {drones!r:.80}")
     check_installed()
     options = Options(
         channels=channels_of(channels),
@@ -334,7 +334,7 @@ START_S: Final = 20.0  #: time allowed for the child to start recording
 _END_S: Final = 15.0  # time allowed to write received samples before the child is terminated
 _HARDER_S: Final = 3.0  # time from terminating the child to killing it
 _TELL_S: Final = 0.25  # interval between the child's status reports
-_NICE: Final = 5  # niceness of the child: the flight has priority
+_NICE: Final = 5  # niceness of the child, so that flying takes precedence
 _log = logging.getLogger(__name__)
 
 
@@ -352,7 +352,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
     status: Status | None = None
     event: RecorderEvent | None = None
     trouble: str = ""  #: why the child could not start
-    usage: bool = False  #: whether that trouble is a UsageError
+    usage: bool = False  #: whether the cause was a UsageError
 
 
 # The child -----------------------------------------------------------------------------------------------------
@@ -391,7 +391,7 @@ def _report(engine: Engine, events: deque[RecorderEvent]) -> None:
 
 
 def _print(line: Line) -> None:
-    with contextlib.suppress(OSError):  # the parent is gone
+    with contextlib.suppress(OSError):  # the parent process has ended
         sys.stdout.buffer.write(msgspec.json.encode(line) + b"\n")
         sys.stdout.buffer.flush()
 

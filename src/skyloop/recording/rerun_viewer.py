@@ -64,7 +64,7 @@ from skyloop.recording.translation import Picture
 
 PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
-_AHEAD: Final = 8 * MB  #: bytes that the viewer may lag behind
+_AHEAD: Final = 8 * MB  #: maximum number of bytes not yet accepted by the viewer
 _PATIENCE_S: Final = 0.5  # time to wait for a slow viewer before dropping samples
 _ASK_NS: Final = nanoseconds(1.0)  # interval between checks that the viewer keeps up
 _LAST_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
@@ -91,7 +91,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer. If a viewer is already listening there, it is used. None: 9876; 0: any free port.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -104,10 +104,10 @@ class RerunViewer:
         check_names(drones, "view")
         rerun_sdk()
         self.left_out = 0  #: samples dropped because the viewer was too slow
-        self._ahead = 0  # bytes that the viewer may not have accepted yet
+        self._ahead = 0  # number of bytes that the viewer may not have accepted yet
         self._stalled = False
         self._due_ns = 0
-        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 shown so far
+        self._chains: dict[tuple[int, str], Chain] = {}  # the H.264 frames shown so far
         clock = ClockPair.now()
         self._channels = frozenset(
             (number, channel)
@@ -288,7 +288,7 @@ TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
 _MOST_SERIES: Final = 64  # maximum number of series and of drawing sources, because applications choose their names
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between points of a path
-_FRUSTUM_M: Final = 0.3  # drawn size of a camera
+_FRUSTUM_M: Final = 0.3  # size at which a camera is drawn
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _STATE: Final[dict[str, tuple[str, ...]]] = {
     "attitude": ("roll [rad]", "pitch [rad]", "yaw [rad]"),
@@ -304,7 +304,7 @@ class Shown:
 
     name: str
     capabilities: Capabilities
-    unix: Callable[[int], int]  #: converts a time on the drone's proxy's clock to Unix time [ns]
+    unix: Callable[[int], int]  #: function from a time on the proxy's clock to Unix time [ns]
 
 
 class RerunLog:
@@ -313,11 +313,11 @@ class RerunLog:
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
         """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
-        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, it is unique.
+        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, one is made up.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
-        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which means nothing in a recording
+        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which is meaningless in a recording
         self._stream.set_log_tick_enabled(False)
         self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
         self._shown = drones
@@ -368,7 +368,7 @@ class RerunLog:
         # Disconnecting, now or when Python exits, could wait for the viewer forever.
         threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
         self._rr.unregister_shutdown()
-        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs, or is closed")
+        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs or is closed")
 
     def _begin(self) -> None:
         self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -543,7 +543,7 @@ class _Drone:
         if entity not in self._titled:
             self._titled.add(entity)
             self._stream.log(entity, self._rr.SeriesLines(names=list(names)), static=True)
-        values = [math.nan if number is None else number for number in numbers]  # drawn as a gap
+        values = [math.nan if number is None else number for number in numbers]  # NaN is drawn as a gap
         self._stream.log(entity, self._rr.Scalars(values))
 
     def _text(self, text: str, severity: Severity) -> None:
@@ -587,7 +587,7 @@ def rerun_sdk() -> Any:
 
 
 def _within(known: set[Any], name: Any) -> bool:
-    """Return whether an application's name gets an entity; their number is limited."""
+    """Return whether to create an entity for an application's name; the number of such names is limited."""
     if name not in known and len(known) < _MOST_SERIES:
         known.add(name)
     return name in known

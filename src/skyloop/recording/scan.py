@@ -24,13 +24,13 @@ from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 MAX_CHUNK: Final = 64 << 20
 #: Maximum compression ratio of a chunk. LZ4 reaches at most 255, and nearly constant data 150.
 MAX_RATIO: Final = 512
-MAX_RECORD: Final = 8 << 20  #: bytes in a metadata record, a schema or a channel; Skyloop's have a few kilobytes
-#: Bytes of metadata, schemas and channels, which are kept in memory. A recording of 100 drones has about 1 MB.
+MAX_RECORD: Final = 8 << 20  #: maximum size of a metadata record, schema or channel [bytes]; Skyloop's have a few kB
+#: Bytes of metadata, schemas and channels, which are kept in memory. In a recording of 100 drones they take about 1 MB.
 MAX_HEAD: Final = 32 << 20
-MAX_PIECES: Final = 500_000  #: chunks in a file; a recorder that closes one per second gets there after five days
-MAX_RECORDS: Final = 5_000_000  #: records outside chunks; Skyloop's recordings have a few hundred
+MAX_PIECES: Final = 500_000  #: maximum number of chunks; at one per second, a recorder writes these in five days
+MAX_RECORDS: Final = 5_000_000  #: maximum number of records outside chunks; Skyloop writes a few hundred
 MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
-_RUN: Final = 4 << 20  #: bytes of messages outside chunks to read at once
+_RUN: Final = 4 << 20  #: size of the messages outside chunks to read at once [bytes]
 
 try:
     from mcap.data_stream import ReadDataStream
@@ -45,7 +45,7 @@ FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
 #: Head of a chunk: first and last time, uncompressed size and CRC, length of the compression's name.
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
-_LONGEST: Final = 1 << 32  #: a record longer than this counts as damage
+_LONGEST: Final = 1 << 32  #: maximum length of a record; a longer one counts as damage
 MAX_NAME: Final = 16  #: maximum length of a compression's name [bytes]
 
 #: Exceptions that reading a damaged record may raise.
@@ -53,7 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # mcap's, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +61,11 @@ class Piece:
     """A chunk, or a run of messages outside chunks."""
 
     offset: int  #: offset of the chunk's data, or of the first record in the run
-    size: int  #: in the file
+    size: int  #: size in the file [bytes]
     start_ns: int = 0  #: log times of its first and last messages; 0 if unknown
     end_ns: int = 0
     compression: str | None = None  #: a chunk's compression, ``""`` if it is not compressed; None for a run of messages
-    crc: int | None = 0  #: 0 if there is none; None if it has not yet been read from the chunk's head
+    crc: int | None = 0  #: checksum; 0 if there is none, None if it has not yet been read from the chunk's head
     unpacked: int = 0  #: uncompressed size of a chunk's records, as announced
     cut: bool = False  #: whether the file ends within it
 
@@ -81,9 +81,9 @@ class Scan:
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
-    cut: str = ""  #: why the file is incomplete, in words; empty for a file with an index and an end
-    damaged: list[str] = field(default_factory=list)  #: unreadable parts, in words
-    head: int = 0  #: bytes of metadata, schemas and channels kept in memory
+    cut: str = ""  #: why the file is incomplete; empty for a file with an index and an end
+    damaged: list[str] = field(default_factory=list)  #: descriptions of unreadable parts
+    head: int = 0  #: size of the metadata, schemas and channels kept in memory [bytes]
 
     def damage(self, what: str) -> None:
         """Add a description of an unreadable part, unless it is already listed."""
@@ -144,7 +144,7 @@ def has_room(found: Scan, size: int) -> bool:
     """Return whether ``size`` more bytes can be kept in memory; if not, list that as damage."""
     found.head += size
     if found.head > MAX_HEAD:
-        found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels: the others are left out")
+        found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels; the rest are skipped")
     return found.head <= MAX_HEAD
 
 
@@ -287,15 +287,15 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """Decompress a chunk's records, or the existing part of a truncated chunk if its compression allows that.
+    """Decompress a chunk's records; of a truncated chunk, those that the compression format allows to be recovered.
 
     Decompress no more than the chunk announces, and nothing if it announces too much.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
         raise ValueError(
-            f"{len(data)} bytes that announce {size} unpacked, but the limits are {MAX_RATIO} times as many and "
-            f"{MAX_CHUNK} in all"
+            f"{len(data)} bytes claim to unpack to {size}, but at most {MAX_RATIO} times as many and "
+            f"at most {MAX_CHUNK} are allowed"
         )
     size = min(size, MAX_CHUNK, MAX_RATIO * len(data))
     if piece.compression == "":
@@ -317,7 +317,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
     else:
         raise ValueError(f"its compression {piece.compression!r} is neither zstd nor lz4")
     if len(unpacked) > size and not piece.cut:
-        raise ValueError(f"it holds more than the {size} bytes that it announces")
+        raise ValueError(f"it contains more than the {size} bytes that it announces")
     if piece.crc and not piece.cut and zlib.crc32(unpacked) != piece.crc:
         raise ValueError("its checksum is wrong")
     return unpacked
@@ -333,7 +333,7 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
         if at + FRAME.size > size:
             return
         if number >= most:
-            raise ValueError(f"more than {most} records in as many bytes: the others are left out")
+            raise ValueError(f"more than {most} records in {most} bytes; the rest are skipped")
         opcode, length = FRAME.unpack_from(data, at)
         begin = at + FRAME.size
         at = begin + length
@@ -413,7 +413,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # with too much content, what gets skipped depends on the order, so a scan is needed
+    return not found.damaged  # if content is skipped for its size, the order matters, so a scan is needed
 
 
 def _header_end(file: IO[bytes]) -> int:
@@ -426,7 +426,7 @@ def _header_end(file: IO[bytes]) -> int:
 
 
 def _summary(found: Scan, file: IO[bytes]) -> tuple[bytes, int] | None:
-    """Return the summary section and where the data before it end; None if it is missing or damaged."""
+    """Return the summary section and the offset where the data before it end; None if it is missing or damaged."""
     at = found.size - _TAIL
     if at < 0:
         return None
@@ -453,7 +453,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         opcode, length = FRAME.unpack_from(data, at)
         at += FRAME.size + length
         if at > len(data):
-            raise ValueError("a record is longer than the summary")
+            raise ValueError("a record extends beyond the summary")
         yield opcode, data[at - length : at]
 
 
@@ -475,7 +475,7 @@ def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
 
 
 def _is_gapless(spans: list[tuple[int, int]], begin: int, end: int) -> bool:
-    """Return whether spans cover the range between two offsets without any gap."""
+    """Return whether spans cover the range between two offsets without gaps."""
     for start, stop in spans:
         if start != begin or stop < start:
             return False

@@ -1,4 +1,4 @@
-"""Subscribe to drones, to record or to show them: samples go to a backlog, frames through an encoder."""
+"""Subscribe to drones in order to record or show them: samples go to a backlog, frames through an encoder."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # in addition to one being encoded and one arriving: a client can't hold more frame slots
+_FRAMES_WAITING: Final = 2  # frames besides one being encoded and one arriving; a client can't hold more frame slots
 _SIZE: Final = 400  #: approximate size of an ordinary sample [bytes]
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # if no frame of the stream arrives for this long, record decoded frames
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # time without a frame of the stream after which decoded frames are recorded
 _PARAMETERS_S: Final = 2.0  # pause before trying again to read parameters
 
 _log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def check_names(drones: Sequence[Drone], of: str) -> None:
     """
     names = [drone.name for drone in drones]
     if len(set(names)) < len(names):
-        raise UsageError(f"the drones of one {of} need different names, got {', '.join(names)}")
+        raise UsageError(f"the drones of a {of} must have different names, got {', '.join(names)}")
 
 
 class Gaps:
@@ -229,7 +229,7 @@ class Stream:
 class Video:
     """One camera's frames. They are encoded on a separate thread unless they arrive as JPEG.
 
-    If the vehicle's encoding is kept, decoded frames are subscribed to only while its stream does not arrive.
+    If the vehicle's encoding is kept, decoded frames are subscribed to only while its stream is not arriving.
     """
 
     def __init__(
@@ -283,7 +283,7 @@ class Video:
             self._thread.join()
 
     def check_stream(self, now_ns: int) -> None:
-        """Subscribe to frames while the vehicle's stream does not arrive (it may differ from what was announced)."""
+        """Subscribe to frames while the vehicle's stream is not arriving (it may differ from what was announced)."""
         if self._stream is not None:
             self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
 
@@ -344,7 +344,7 @@ def encoder(options: Options) -> Encode:
         import cv2
     except ImportError as error:
         raise MissingExtraError("recording raw frames", "record", cause=str(error)) from None
-    if options.encoding == "png":  # level 1 is twice as fast as the default, and files are hardly larger
+    if options.encoding == "png":  # level 1 is twice as fast as the default and makes files hardly larger
         suffix, settings = ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]
     else:
         suffix, settings = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, options.quality]
@@ -377,7 +377,7 @@ class Parameters:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._ended = True
         self._wake.set()
         if self._thread.ident is not None:  # start() may have failed before starting the thread
@@ -417,9 +417,9 @@ class Parameters:
 
 
 BEAT_S: Final = 0.02  #: interval between polls of the backlog; polling spares receiving threads from waking the view
-_BATCH: Final = MB  # bytes to show before asking the screen again which sources it needs
-_LIMIT: Final = 16 * MB  # bytes held for a slow screen; older images are useless to a viewer
-_RESERVE: Final = 16 * MB  # bytes above that limit for samples that must not be dropped
+_BATCH: Final = MB  # number of bytes to show before asking the screen again which sources it needs
+_LIMIT: Final = 16 * MB  # maximum number of bytes held for a slow screen; older images are useless to a viewer
+_RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
 _LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the streams
 NICENESS: Final = 5
@@ -450,7 +450,7 @@ class View:
         """
         check_names(drones, "view")
         self.failed = 0  #: number of samples that could not be shown
-        self.failed_why = ""  #: channel and error of the last one
+        self.failed_why = ""  #: channel and error of the last such sample
         self._drones = drones
         self._screen = screen
         self._backlog = Backlog(_LIMIT, _RESERVE)
@@ -529,6 +529,6 @@ class View:
 
 
 def give_way() -> None:
-    """Lower the priority of this process and of threads that it starts later, because the flight has priority."""
+    """Lower the priority of this process and of threads that it starts later, so that flying takes precedence."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)

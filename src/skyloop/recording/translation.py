@@ -32,7 +32,7 @@ from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, Res
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
 
-_SEQUENCES: Final = 1 << 32  # MCAP's sequence numbers have 32 bits
+_SEQUENCES: Final = 1 << 32  # number of MCAP's sequence numbers, which have 32 bits
 _PLACES: Final = 400  #: maximum number of points in a path; when it is exceeded, every second one is removed
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between messages that hold a path
 
@@ -68,7 +68,7 @@ class Schema:
 
 @dataclass(slots=True, eq=False)
 class Picture:
-    """A frame in the form written to the file."""
+    """A frame as it is written to the file."""
 
     record: FrameRecord
     data: bytes

@@ -1,4 +1,4 @@
-"""The writing thread: takes samples from the backlog, translates and writes them, and monitors the disk; its files."""
+"""The writing thread and its files: takes samples from the backlog, translates and writes them, watches the disk."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
 from skyloop.recording.translation import Message, Picture, Schema, Translator
 
-CHUNK: Final = MB  #: a chunk is closed after this many bytes, or earlier by :meth:`RecordingFile.commit`
+CHUNK: Final = MB  #: size at which a chunk is closed, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
-_COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
-_REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
+_COMMIT_NS: Final = nanoseconds(0.5)  #: time within which samples reach the file, unless the disk is too slow
+_REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that was full
 #: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
-_SILENCE_NS: Final = nanoseconds(2.0)  #: if no H.264 arrives for this long, a full file does not wait for a key frame
+_SILENCE_NS: Final = nanoseconds(2.0)  #: time without H.264 after which a full file does not wait for a key frame
 _LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk, and between attempts to resume writing
 
 Tell = Callable[[str, Severity], None]
@@ -63,8 +63,8 @@ class Output:
     """The MCAP writer's stream. Nothing reaches the file until :meth:`flush`, which writes everything or nothing."""
 
     def __init__(self, target: Target) -> None:
-        self.committed = 0  #: bytes in the file, always ending at a record boundary
-        self.waiting = 0  #: bytes not yet in the file
+        self.committed = 0  #: number of bytes in the file, which end at a record boundary
+        self.waiting = 0  #: number of bytes not yet in the file
         self._target = target
         self._pieces: list[bytes] = []
 
@@ -107,7 +107,7 @@ class RecordingFile:
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
-        """Create the file and write its metadata. ``clock`` relates monotonic to Unix time.
+        """``clock`` relates monotonic time to Unix time.
 
         Raise ``OSError`` if the file can't be created or written.
         """
@@ -168,7 +168,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Close the file as it is, readable up to the last commit but without a summary. Remove it if it is empty."""
+        """Close the file, which is readable up to the last commit but has no summary, and remove it if it is empty."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)
@@ -208,15 +208,15 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise without opening a file. ``tell`` runs on the writing thread, or at first on :meth:`start`'s."""
+        """Initialise without opening a file. ``tell`` is called on the writing thread or, at first, :meth:`start`'s."""
         self.state = RecorderState.STARTING  #: state of the recorder
         self.reason = ""  #: why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
         self.room = Room.ALL  #: which samples to write, given the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
-        self.unwritable_why = ""  #: channel and error of the last one
+        self.unwritable_why = ""  #: channel and error of the last such sample
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
-        #: returns the totals of missed samples by drone and channel, for the end of each file
+        #: function that returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
         self.each_second: Callable[[], None] = lambda: None  #: called each second on the writing thread
         self._path = path
@@ -262,7 +262,7 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write all received samples and close the file. If the disk hangs, leave it to the thread. Idempotent."""
+        """Write all received samples and close the file; if the disk hangs, leave this to the thread. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
@@ -275,7 +275,7 @@ class FileWriter:
 
     @property
     def path(self) -> Path:
-        """The current file, or the last one."""
+        """The current file or, if there is none, the last one."""
         return self.files[-1] if self.files else self._path
 
     @property
@@ -295,13 +295,13 @@ class FileWriter:
     def _run(self) -> None:
         try:
             self._work()
-        except Exception as error:  # noqa: BLE001  (the state must never say that this still records)
+        except Exception as error:  # noqa: BLE001  (the state must never claim that this is still recording)
             self._fail(error)
 
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # if paused, try once more; and write the final counts
+        self._look_due_ns = 0  # so that it tries once more if paused, and writes the final counts
         self.step(time.monotonic_ns())
         self._end()
 
@@ -353,7 +353,7 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # before writing, so that nothing is lost if the disk fails in the middle
+        self._uncommitted += batch  # done before writing, so that nothing is lost if the disk fails in the middle
         for item in batch:
             for message in self._messages(item):
                 file.write(message)
@@ -462,7 +462,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """Pause because the disk fails. Samples not yet committed wait for the next file."""
+        """Pause because writing to the disk failed. Samples not yet committed wait for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()

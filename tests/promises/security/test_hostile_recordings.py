@@ -161,7 +161,7 @@ def test_a_part_that_is_too_large_is_reported_and_the_rest_is_read(tmp_path: Pat
     path = with_records(tmp_path / "x.mcap", flight, zstd_zeros(), chunk("", one, len(one)))
     recording = Recording.open(path)
     assert list(recording.entries()) == []
-    assert f"announce {ZEROS} unpacked" in " ".join(recording.damaged)
+    assert f"claim to unpack to {ZEROS}" in " ".join(recording.damaged)
 
 
 def test_metadata_and_channels_without_end_are_left_out(
@@ -184,7 +184,7 @@ def test_metadata_and_channels_without_end_are_left_out(
         len(one.topic) for one in found.channels.values()
     )
     assert kept < 120_000
-    assert any("the others are left out" in words for words in found.damaged)
+    assert any("the rest are skipped" in words for words in found.damaged)
     assert any("at most 50000 are read" in words for words in found.damaged)
 
 

@@ -44,7 +44,7 @@ def test_options_of_navdata(text: str, mask: int) -> None:
 @pytest.mark.parametrize(
     ("address", "says"),
     [
-        ("ardrone://", "looks like ardrone://192.168.1.1"),
+        ("ardrone://", "look like ardrone://192.168.1.1"),
         ("ardrone://192.168.1.1:5556", "at_port=5556"),
         ("ardrone://a b", "not the name or IPv4 address"),
         ("ardrone:///dev/video0", "not the name or IPv4 address"),

@@ -154,7 +154,7 @@ def test_unknown_keys_and_unusual_values() -> None:
 
 def test_texts_without_a_value() -> None:
     entry = entries_of(DRONES[2], 2)["camera.active"]
-    with pytest.raises(DecodeError, match="not the number of one of"):
+    with pytest.raises(DecodeError, match="not the index of one of"):
         entry.from_text("7")
     assert not taken(entry, "1", "bottom")
 

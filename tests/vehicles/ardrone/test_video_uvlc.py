@@ -91,7 +91,7 @@ def test_the_request_is_repeated(port: UdpPort) -> None:
         assert port.wait() == WAKE
     finally:
         receiver.stop()
-    assert viewer.texts(VideoEvent.LOST) == [f"{HOST}:{port.port}: no frame came for 3 s"]
+    assert viewer.texts(VideoEvent.LOST) == [f"{HOST}:{port.port}: no frame arrived for 3 s"]
 
 
 def test_datagrams_of_others_are_ignored(port: UdpPort, packets: list[bytes]) -> None:

@@ -259,7 +259,7 @@ def test_bad_options_are_refused(query: str, message: str) -> None:
 
 
 def test_an_address_without_a_file_is_refused() -> None:
-    with pytest.raises(UsageError, match="names no file"):
+    with pytest.raises(UsageError, match="names neither a file nor a camera"):
         make_driver("video://")
 
 
@@ -299,8 +299,8 @@ def _sound(folder: Path) -> Path:
         (lambda folder: folder / "shot%2503d.png", UsageError, "shot%03d.png cannot be opened"),
         (_text, FileFormatError, "notes.mp4 cannot be opened as a video"),
         (_empty, FileFormatError, "empty.mkv cannot be opened as a video"),
-        (_no_pave, FileFormatError, "noise.pave holds no frame of a PaVE stream"),
-        (_sound, FileFormatError, "sound.wav holds no video stream"),
+        (_no_pave, FileFormatError, "noise.pave contains no PaVE frame"),
+        (_sound, FileFormatError, "sound.wav contains no video stream"),
     ],
 )
 def test_a_bad_file_is_reported_on_opening(
@@ -436,8 +436,8 @@ def test_a_device_that_disappears_is_reopened_with_exposure_and_gain(device: Pat
 @pytest.mark.parametrize(
     ("uri", "message"),
     [
-        ("video:///dev/video0?loop=1", "loop and speed are for files, not live cameras"),
-        ("video:///dev/video0?speed=2", "loop and speed are for files, not live cameras"),
+        ("video:///dev/video0?loop=1", "loop and speed apply only to files, not to live cameras"),
+        ("video:///dev/video0?speed=2", "loop and speed apply only to files, not to live cameras"),
         ("video:///tmp/x.mp4?gain=3", "only a device has gain"),
         ("video://rtp://:5600?format=mjpeg", "only a device has format"),
         ("video:///dev/video0?format=png", "format of video:// named 'png'"),

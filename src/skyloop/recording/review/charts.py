@@ -23,8 +23,8 @@ LEFT: Final = 64  #: left margin for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
 AXIS: Final = 20  #: margin for the labels of the time axis
-BUCKETS: Final = 700  #: a line has at most twice this many points: the minimum and maximum in each bucket
-GAP_FACTOR: Final = 8.0  #: a step longer than this many typical ones leaves a gap in the line
+BUCKETS: Final = 700  #: number of buckets of a line, each drawn as its minimum and maximum
+GAP_FACTOR: Final = 8.0  #: minimum length of a gap in a line, as a multiple of the typical step
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Line:
     values: Floats
     style: str = "c1"
     dashed: bool = False
-    steps: bool = False  #: draw steps: each value holds until the next one
+    steps: bool = False  #: whether to draw steps, which hold each value until the next one
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +233,7 @@ def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) 
 
 
 def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int = 48) -> str:
-    """Draw a path in pieces whose colours run from that of the start to that of the end."""
+    """Draw a path in pieces whose colours run from the start colour to the end colour."""
     if len(points) < 2:
         return ""
     span = max(float(t_s[-1] - t_s[0]), 1e-9)

@@ -68,13 +68,13 @@ class FieldDifference:
 class Comparison:
     """The commands of two flights on one time axis, which starts with the older recording."""
 
-    aligned: str  #: how the times are aligned, in words
+    aligned: str  #: description of how the times are aligned
     old: Commands
     new: Commands
-    seconds: float  #: duration of the compared part
+    seconds: float  #: duration of the part that is compared
     same_action: float  #: fraction of that duration with the same kind of action in both
     fields: tuple[FieldDifference, ...]
-    part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None if none
+    part_at_s: float | None  #: first difference, in kind or by more than :data:`PART`; None if there is none
     counts: tuple[int, int]
 
 
@@ -88,7 +88,7 @@ def compare(
 ) -> Comparison:
     """Compare the commands that applications requested (or those applied), excluding the proxies' own.
 
-    The times of a recorded replay are mapped to the old flight; otherwise the first commands are aligned.
+    The times of a recorded replay are mapped to those of the old flight; otherwise the first commands are aligned.
 
     Args:
         old: The older recording.
@@ -108,7 +108,7 @@ def compare(
     newer = _commands(new, new_name, what, zero_ns, offset_ns)
     for recording, commands in ((old, older), (new, newer)):
         if not len(commands.times_s):
-            raise FileFormatError(f"{recording.path} holds no commands: there is nothing to compare")
+            raise FileFormatError(f"{recording.path} contains no commands to compare")
     begin = max(older.times_s[0], newer.times_s[0])
     end = min(older.times_s[-1], newer.times_s[-1])
     grid = np.arange(begin, max(end, begin) + 1e-9, 1.0 / RATE_HZ)

@@ -29,8 +29,8 @@ MARK: Final = "mark"  #: name of a logged text that starts a new episode and nam
 TAUGHT: Final = "action"  #: name of logged arrays that hold the demonstrated action for an image
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
-_GAP_S: Final = 0.5  #: an episode ends if no image or no state arrives for this long
-_SHORTEST_S: Final = 1.0  # shorter episodes are left out
+_GAP_S: Final = 0.5  #: time without an image or state after which an episode ends
+_SHORTEST_S: Final = 1.0  # minimum duration of an episode; shorter ones are skipped
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -55,7 +55,7 @@ class Form:
 class Episode:
     """One flight, or a part of one marked by the application."""
 
-    task: str  #: the task, in words
+    task: str  #: description of the task
     state: Floats  #: state when the first camera's image was captured, shape (rows, len(form.state)), float64
     #: action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64
     action: Floats
@@ -75,17 +75,17 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
     if not state:
-        raise FileFormatError("the recording has no states of the drone: record the channel feedback")
+        raise FileFormatError("the recording has no state of the drone: record the feedback channel")
     for camera in cameras:
         if f"frames.{camera}" not in tables:
             raise FileFormatError(f"the recording has no frames of {camera}")
     asked: set[str] = set() if commands is None else {str(name) for name in commands["asked"][_piloted(commands)]}
     kinds = asked & (ACTIONS.keys() | {"position"})
     if not kinds:
-        raise FileFormatError("the recording has no set-points of an application: there is nothing to learn")
+        raise FileFormatError("the recording has no set-points from an application, so there is nothing to learn")
     if len(kinds) > 1 or kinds == {"position"}:
         raise UsageError(
-            f"the recording was flown by {' and '.join(sorted(kinds))} set-points: an action is either velocity "
+            f"the recorded flight used {' and '.join(sorted(kinds))} set-points: an action is either velocity "
             "(forward, left, up, yaw rate) or attitude (roll, pitch, climb, yaw rate)"
         )
     return Form(state, kinds.pop(), tuple(cameras), fps)
@@ -95,12 +95,12 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     """Cut a recording into episodes.
 
     An episode lasts while the drone follows set-points without a gap in images or state, and is cut at marks. Its rows
-    are ``1 / form.fps`` apart. Each has the newest image from every camera, the state at the first camera's capture
-    time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering counts as
-    a set-point of zeros. If an application logs arrays named ``action``, these are used as the actions instead: each
-    row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``: name of the task
-    where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError`` if a logged
-    action has a different number of values than the form's set-points.
+    are ``1 / form.fps`` apart. Each contains the newest image from every camera, the state at the first camera's
+    capture time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering
+    counts as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
+    instead: each row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``:
+    name of the task where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError``
+    if a logged action has a different number of values than the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -219,16 +219,16 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: images between key frames: training reads images in any order
-_LOOKED_AT_EVERY: Final = 16  #: one in this many rows is sampled for the statistics
-_THINNED: Final = 4  #: only every fourth row and column of a sampled image is used
+_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in any order
+_LOOKED_AT_EVERY: Final = 16  #: number of rows of which one is sampled for the statistics
+_THINNED: Final = 4  #: spacing of the rows and columns used from a sampled image
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's images from all episodes at a steady rate, in an H.264 MP4 file, which an error removes."""
+    """An H.264 MP4 file with one camera's images from all episodes at a steady rate. An error removes it."""
 
     def __init__(self, path: Path, fps: float) -> None:
         #: number of rows that repeat the previous image because theirs could not be decoded
@@ -282,7 +282,7 @@ class Film:
             while at < len(wanted) and wanted[at] <= captured_ns:
                 self._encode(image, recording.path)
                 at += 1
-        for _ in wanted[at:]:  # images missing at the end of a truncated file
+        for _ in wanted[at:]:  # the file is truncated: images are missing at its end
             if image is None:
                 raise FileFormatError(f"{recording.path}: no image of {camera} can be decoded")
             self.repeated += 1
@@ -302,8 +302,8 @@ class Film:
             self._begin(width, height)
         if (width, height) != (self.width, self.height):
             raise UsageError(
-                f"{path} has images of {width}×{height}, the first ones were {self.width}×{self.height}: "
-                "export recordings that don't match separately"
+                f"{path} has {width}×{height} images, but the first ones were {self.width}×{self.height}: "
+                "export mismatched recordings separately"
             )
         if self._rows % _LOOKED_AT_EVERY == 0:
             self._looked_at.append(image[::_THINNED, ::_THINNED].copy())

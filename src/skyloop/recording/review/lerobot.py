@@ -95,7 +95,7 @@ def export_lerobot(
     form, flights = _read(recordings, drone, cameras, fps, task, doing)
     whole = [episode for _, _, flown in flights for episode in flown]
     if not whole:
-        raise FileFormatError("no recorded flight follows set-points for at least a second with images")
+        raise FileFormatError("no recorded flight has images and follows set-points for at least a second")
     writer.make_folders()
     films: dict[str, Film] = {}
     for camera in form.cameras:
@@ -138,7 +138,7 @@ def _read(
         if here != form:
             raise UsageError(
                 f"{recording.path} has {_words(here)}, and {recordings[0].path} {_words(form)}: "
-                "export recordings that don't match separately, or choose the cameras that all have"
+                "export mismatched recordings separately, or choose cameras that all of them have"
             )
         flights.append((recording, name, episodes(found, form, task)))
     if form is None:

@@ -38,12 +38,12 @@ _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
 _MOST_EVENTS: Final = 500  # maximum number of events listed on the page
-_LONGEST_STEP_S: Final = 0.5  #: velocity is not integrated across a longer step
+_LONGEST_STEP_S: Final = 0.5  #: longest step across which velocity is integrated
 _WIDTH: Final = 360  #: width of a thumbnail [px]
 _QUALITY: Final = 80  # JPEG quality of thumbnails
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: fraction of the usual spacing: skip an evenly spaced frame that is this close to one at an event
-_SAME_CLOCK_S: Final = 60.0  #: skip longer delays, because the two clocks must be unrelated
+_NEAR: Final = 0.4  #: fraction of the usual spacing; an evenly spaced frame this close to one at an event is skipped
+_SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer ones are skipped, because the two clocks must be unrelated
 
 
 def write_report(
@@ -68,7 +68,7 @@ def write_report(
 
 
 def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
-    """Create the head of the page, the path and the charts over time."""
+    """Create the page with its header, the path and the charts over time."""
     ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)
@@ -291,7 +291,7 @@ class Way:
     t_s: Floats
     x: Floats
     y: Floats
-    source: str  #: where the path comes from, in words
+    source: str  #: description of the path's source
 
     @property
     def length_m(self) -> float:
@@ -302,7 +302,7 @@ class Way:
 def way_of(feedback: Table) -> Way | None:
     """Return the drone's path, or None if it is unknown.
 
-    Uses the vehicle's position if there is one, otherwise the simulator's true one, otherwise the integrated velocity.
+    Uses the vehicle's own position or, failing that, the simulator's true one or the integrated velocity.
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
@@ -340,7 +340,7 @@ def airborne_s(feedback: Table) -> float:
 def flight_facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """Return the figures that are known for the head of a report, as names and values."""
+    """Return the known figures for a report's header, as names and values."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
@@ -418,7 +418,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    It has full size if it can't be scaled here; it is empty if damaged, or if it is H.264 that can't be decoded here.
+    It has full size if it can't be scaled here, and is empty if damaged or if it is H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

@@ -20,15 +20,15 @@ from skyloop.recording.scan import Message, Scan, Schema, attachments, open_file
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-GAP_FACTOR: Final = 3.0  #: a step between two messages counts as a gap if it is longer than this many typical steps
-MIN_STEPS: Final = 5  #: with fewer steps, the typical step is unknown
+GAP_FACTOR: Final = 3.0  #: minimum length of a gap between two messages, as a multiple of the typical step
+MIN_STEPS: Final = 5  #: number of steps needed to determine the typical step
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
     """Statistics on the time between two timestamps of a sample [s]."""
 
-    what: str  #: the two timestamps, in words
+    what: str  #: names of the two timestamps
     median_s: float
     p99_s: float
 
@@ -41,9 +41,9 @@ class Row:
     schema: str
     count: int
     rate_hz: float | None  #: None if there is only one message, or if all have the same time
-    gaps: int  #: steps longer than three typical ones; counted in steady channels only
+    gaps: int  #: number of steps longer than three typical ones, in steady channels only
     longest_s: float | None  #: longest step between two messages [s]
-    missing: int  #: messages missing according to gaps in the samples' own numbers
+    missing: int  #: messages missing according to gaps in the samples' sequence numbers
     bytes: int
     steady: bool  #: whether messages arrive at a steady rate, so that rate and gaps are meaningful
     delays: tuple[Delay, ...] = ()
@@ -58,7 +58,7 @@ class Summary:
     dropped: dict[str, dict[str, int]]  #: samples dropped by the recorder, by drone and channel
     missed: dict[str, dict[str, int]]  #: samples that never reached the recorder, by drone and channel
     events: dict[str, int]  #: number of events by severity
-    notes: tuple[str, ...] = ()  #: problems with the file, in words
+    notes: tuple[str, ...] = ()  #: descriptions of problems with the file
 
 
 @dataclass(slots=True)
@@ -186,7 +186,7 @@ class Recovered:
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
     """Read every byte of a recording and describe its problems; return nothing if it is intact."""
     for _ in recording.entries(progress=progress):
-        pass  # reading verifies the checksums
+        pass  # reading is enough: it verifies the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 

@@ -40,7 +40,7 @@ ACTION_FIELDS: Final = (
     *("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate"),
     *("x", "y", "z", "yaw", "speed", "turn_rate"),
 )
-_ABSURD: Final = 1e30  #: maximum value in any unit: its square, and sums of many of these, must not overflow
+_ABSURD: Final = 1e30  #: maximum value in any unit: sums of many squared values must not overflow
 Cell = float | int | str | bool | None
 
 
@@ -290,7 +290,7 @@ def read(
     """Read the tables to export. Raise ``FileFormatError`` if the recording has none of these channels."""
     found = tables(recording, drone, channels or TABLES, progress)
     if not found:
-        raise FileFormatError(f"{recording.path} holds none of these channels of {drone}")
+        raise FileFormatError(f"{recording.path} contains none of these channels for {drone}")
     return found
 
 
@@ -309,7 +309,7 @@ def _text(cell: Any) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Prefix text that a spreadsheet would take for a formula with an apostrophe; leave numbers unchanged."""
+    """Prefix an apostrophe to text that a spreadsheet would interpret as a formula; leave numbers unchanged."""
     return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
 
 

@@ -24,8 +24,8 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
-_TIME_BASE: Final = Fraction(1, 60_000)  #: each image keeps its own timestamp; MPEG-4 allows at most 65535
-_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: by preference; the first one in this PyAV build is used
+_TIME_BASE: Final = Fraction(1, 60_000)  #: unit that gives each image its own timestamp; MPEG-4 allows at most 65535
+_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: codecs by preference; the first that PyAV has is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +212,7 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 
 
 TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual one for video
-MAX_FILES: Final = 50  #: a stream that would need more files is encoded instead
+MAX_FILES: Final = 50  #: maximum number of files; a stream that would need more is encoded instead
 _LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames: 31 bits hold less than seven hours
 _USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration given to the last image
 
@@ -382,7 +382,7 @@ class _File:
             self._shortened += stamp - self._stamp - _LONGEST_STEP
             stamp = self._stamp + _LONGEST_STEP
         packet.pts = packet.dts = self._stamp = stamp
-        packet.duration = _USUAL_STEP  # applies only to the last frame: the others end when the next one starts
+        packet.duration = _USUAL_STEP  # used only for the last frame: the others end when the next one starts
         packet.time_base, packet.stream, packet.is_keyframe = TIME_BASE, self._stream, key
         self._container.mux(packet)
         self.frames += 1

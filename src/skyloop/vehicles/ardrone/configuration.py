@@ -1,4 +1,4 @@
-"""Reading and writing the drone's configuration, and setting the drone up after each link loss. Pure.
+"""Read and write the drone's configuration, and set the drone up after each link loss. Pure.
 
 ``CONFIG`` writes a key once the acknowledge bit in navdata is clear. The drone sets the bit when it has received the
 command, which does not mean that it accepted the value; ``CTRL 5`` clears the bit for the next command. ``CTRL 4``
@@ -22,7 +22,7 @@ from skyloop.vehicles.ardrone.wire.navdata import State
 
 REPEAT_NS: Final = nanoseconds(0.15)  #: time between repeats of an unacknowledged CONFIG: two periods of demo mode
 REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: time between repeats of a request for the dump
-MAX_DUMP: Final = 1 << 18  #: greatest accepted size of a dump in bytes; real ones have about 5000
+MAX_DUMP: Final = 1 << 18  #: maximum accepted size of a dump in bytes; real ones have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
 _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
@@ -47,7 +47,7 @@ Step: TypeAlias = Write | Read
 class Exchange:
     """A sequence of steps, and a callback that is called at the end."""
 
-    steps: Iterator[Step]  #: may be a generator: each step is fetched after the previous one has finished
+    steps: Iterator[Step]  #: possibly a generator: each step is fetched after the previous one has finished
     deadline_ns: int  #: deadline for all steps together
     done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with the failure or None
 
@@ -73,7 +73,7 @@ class Configurator:
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}  #: the configuration as last read
-        self.ids: Ids | None = None  #: ids sent before each CONFIG
+        self.ids: Ids | None = None  #: ids to send before each CONFIG
         self.wants_dump = 0  #: number of the dump for which a connection to the control port is needed; 0 if none is
         self.trouble = ""  #: why the last dump failed
         self._queue: deque[Exchange] = deque()

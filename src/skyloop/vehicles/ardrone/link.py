@@ -39,7 +39,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back; return the failure or None. Takes up to 0.9 s; not for the link's thread."""
+        """Write a key and read it back, within 0.9 s; return the failure or None. Not for the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
@@ -87,7 +87,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     def _serve_dump(self) -> None:
         with self.lock:
             self._dump.serve(self.session.configurator)
-            self.session.due_ns = 0  # continue at once
+            self.session.due_ns = 0  # so that it continues at once
 
 
 def _connected(address: str, port: int) -> socket.socket:
@@ -169,7 +169,7 @@ class DumpClient:
         connection.setblocking(False)
         try:
             code = connection.connect_ex((self.address, self._port))
-        except OSError as error:  # no usable address
+        except OSError as error:  # there is no usable address
             connection.close()
             configurator.dump_failed(self._with_port(error.strerror or str(error)))
             return

@@ -28,12 +28,12 @@ KNOWN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class ArdroneOptions:
-    """A parsed address."""
+    """The contents of a parsed ``ardrone://`` address."""
 
     host: str
     ports: Ports = navdata.STANDARD
     version: int | None = None  #: the drone's version; None to read it from the configuration
-    full: bool = False  #: navdata at 200 Hz with all options instead of the demo mode
+    full: bool = False  #: whether to request navdata at 200 Hz with all options instead of the demo mode
     navdata_options: int | None = None  #: one bit per tag; None to leave the drone's configuration as it is
     rate_hz: float = 50.0  #: maximum rate of feedback
     video: bool = True
@@ -44,7 +44,7 @@ def options_of(uri: VehicleUri) -> ArdroneOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")
+        raise UsageError(f"{uri} names no host; it should look like ardrone://192.168.1.1")
     if not _HOST.match(uri.place):
         hint = "; ports are given as options, such as ?at_port=5556" if ":" in uri.place else ""
         raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")

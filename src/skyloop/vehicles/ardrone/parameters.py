@@ -113,7 +113,7 @@ class Entry:
         if self.names:
             number = int(str(value))
             if not 0 <= number < len(self.names):
-                raise DecodeError(f"{text!r} is not the number of one of {', '.join(self.names)}")
+                raise DecodeError(f"{text!r} is not the index of one of {', '.join(self.names)}")
             return self.names[number]
         if self.divisor != 1.0 and isinstance(value, int | float):
             return value / self.divisor
@@ -150,7 +150,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, reported: str) -> bool:
-    """Return whether the drone reports the written value, whatever its number format."""
+    """Return whether the drone reports the written value, regardless of its number format."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:
@@ -258,7 +258,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen the range to include the present value, which shows that this drone allows more than is documented."""
+    """Widen the range to include the current value, which shows that this drone allows more than is documented."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))

@@ -47,7 +47,7 @@ class PaveDecoder:
         self._needs_key = True
 
     def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
-        """Return a frame's image, or None. Never raises, whatever the content."""
+        """Return a frame's image, or None. Never raises, regardless of content."""
         follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
         self._needs_key = self._needs_key or frame.after_damage or not follows
         self._number = frame.number

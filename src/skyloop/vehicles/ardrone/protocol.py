@@ -25,12 +25,12 @@ from skyloop.vehicles.ardrone.telemetry import (
 from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
 from skyloop.vehicles.ardrone.wire.navdata import Demo, Navdata, State
 
-#: Number of datagrams that begin at sequence 1 after a restart; one may be lost, and only a 1 resets the drone's count.
+#: Number of datagrams that begin at sequence 1 after a restart: one may be lost, and only a 1 resets the drone's count.
 FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes only those numbered higher than the last; a 1 restarts its count."""
+    """Numbers the commands. The drone executes one only if its number exceeds the last; a 1 restarts the count."""
 
     def __init__(self) -> None:
         self._sequence = 0
@@ -57,14 +57,14 @@ TICK_NS: Final = nanoseconds(0.03)  #: time between AT commands, as recommended 
 HURRY_NS: Final = nanoseconds(
     0.01
 )  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
-DEGRADED_NS: Final = nanoseconds(0.25)  #: silence after which the link is DEGRADED
-LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+DEGRADED_NS: Final = nanoseconds(0.25)  #: time without data after which the link is DEGRADED
+LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link is LOST
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
 SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
-SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: then the link is DEGRADED and the drone may fly without set-up
-DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone is ignoring our commands
-REPEATS: Final = 3  #: how many times an unacknowledged command is sent
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: time until the link is DEGRADED and the drone may fly without set-up
+DEAF_NS: Final = nanoseconds(1.0)  #: time after which a set watchdog bit means that the drone ignores our commands
+REPEATS: Final = 3  #: number of times an unacknowledged command is sent
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
 
 _WATCHDOG: Final[AtMessage] = ("COMWDG", ())
@@ -147,7 +147,7 @@ class ArdroneSession(VehicleSession):
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_navdata(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the navdata port. Never raises, whatever the content."""
+        """Handle a datagram from the navdata port. Never raises, regardless of content."""
         navdata = self.reception.receive(datagram, now_ns)
         if navdata is None:
             return
@@ -169,9 +169,9 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even during a silence too short to count as a lost link.
+        """Detect that the drone restarted or lost us, even in a gap too short to count as a lost link.
 
-        The drone may have lost its set-up in the process. Two consecutive datagrams must show it.
+        The drone may have lost its set-up in the process. Two consecutive datagrams must show the change.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state

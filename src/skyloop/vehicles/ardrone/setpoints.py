@@ -1,4 +1,4 @@
-"""Turning set-points into ``REF`` and ``PCMD``, tick by tick. Pure.
+"""Convert set-points to ``REF`` and ``PCMD``, tick by tick. Pure.
 
 ``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
 emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps it
@@ -58,7 +58,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the limits in force according to the drone's configuration; None if any is missing or not positive."""
+    """Return the current limits according to the drone's configuration; None if any is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):
@@ -104,9 +104,9 @@ def _share(value: float, limit: float) -> float:
     return clamped(value / limit, 1.0) + 0.0  # avoids a negative zero
 
 
-TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not taken off by then is refusing to
-RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time of sending a take-off is ours, not another program's
-#: Navdata shows the effect of the emergency bit within this time, on both ends' clocks.
+TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still on the ground is refusing to take off
+RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which a rise is ours, not another program's
+#: Navdata shows the effect of the emergency bit within this time, whether by the drone's clock or by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
@@ -141,7 +141,7 @@ class Condition:
         return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
-#: After this much silence a flying drone may have landed, because it lands after 2 s without commands.
+#: After this long without contact a flying drone may have landed, because it lands after 2 s without commands.
 SILENT_NS: Final = nanoseconds(0.25)
 
 
@@ -160,7 +160,7 @@ class SetpointController:
     """
 
     def __init__(self) -> None:
-        self.condition: Condition | None = None  #: as shown by the newest navdata; None while the drone is silent
+        self.condition: Condition | None = None  #: according to the newest navdata; None while the drone is silent
         self.limits: StickLimits | None = None  #: None until they have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
@@ -168,13 +168,13 @@ class SetpointController:
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
-        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
-        self._releasing = False  # whether a reset was requested and navdata does not show it yet
+        self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
+        self._releasing = False  # whether a reset was requested that does not show in navdata yet
         self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
-        self._bit_due = False  # whether to set the bit next, whatever navdata shows
-        self._changed_ns = 0  # time of the last change of or request for the bit, or of the end of an emergency
-        self._passed_ns = 0  # the drone's own time from then until the newest navdata
+        self._bit_due = False  # whether to set the bit next, regardless of navdata
+        self._changed_ns = 0  # when the bit last changed or was requested, or an emergency ended
+        self._passed_ns = 0  # drone's own time from then until the newest navdata
         self._received_ns = 0
         self._late_ns = 0  # age of the delayed navdata that arrives in a burst after a gap
         self._warned_blind = False
@@ -276,8 +276,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        ``passed_ns`` is the drone's own time since the previous navdata, None if it is the same as here. It
-        distinguishes delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata; None if it equals the time that passed here.
+        This tells delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
@@ -296,7 +296,7 @@ class SetpointController:
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the drone itself may start the next one
+            self._landing_is_ours = False  # the next landing may be one that the drone starts itself
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)
@@ -343,7 +343,7 @@ class SetpointController:
 
     def _on_bit(self, now_ns: int) -> None:
         self._changed_ns = now_ns
-        self._passed_ns = self._received_ns - now_ns  # minus the age of the newest navdata; more may be on its way
+        self._passed_ns = self._received_ns - now_ns  # negative age of the newest navdata; more may be on its way
 
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)

@@ -1,4 +1,4 @@
-"""Converting navdata to feedback: order and time of datagrams, units, axes, signs and state bits. Pure.
+"""Convert navdata to feedback: order and time of datagrams, units, axes, signs and state bits. Pure.
 
 The drone's body axes are x forward, y right, z down: positive ``theta`` is nose up, positive ``phi`` right side down,
 positive ``psi`` clockwise seen from above, and ``vy`` points right. A datagram from a real, tilted AR.Drone 2 confirmed
@@ -37,7 +37,7 @@ from skyloop.vehicles.ardrone.wire.navdata import (
 
 #: Period of the drone's datagrams in demo mode (True, as before its set-up) and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
-RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after this, a lower sequence number is a restart, not a late datagram
+RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: gap after which a lower number means a restart, not a late datagram
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
 
@@ -78,7 +78,7 @@ class Reception:
         self._accepted_ns = 0
 
     def telemetry(self) -> dict[str, Value]:
-        """Return the counts with the names that they have in ``Feedback.native``."""
+        """Return the counts under their names in ``Feedback.native``."""
         return {f"navdata.{name}": count for name, count in self.counts.items()}
 
     def _is_new(self, sequence: int, now_ns: int) -> bool:
@@ -285,7 +285,7 @@ _REASONS: Final = (
 
 
 def emergency_reason(state: State) -> str:
-    """Return why the motors are cut, as names separated by commas, or ``unknown``."""
+    """Return the reasons why the motors are cut, separated by commas, or ``unknown``."""
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 

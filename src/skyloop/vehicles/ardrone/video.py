@@ -1,10 +1,10 @@
 """The drone's video port: streams, frames and their times, decoders, and cameras.
 
 An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
-requesting them. The stamps in PaVE headers are the drone's own time in milliseconds, 32 bits
-(``video_encapsulation.h`` in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the
-capture. The intrinsics for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch)
-for 640×360 images; other drones differ by a few per cent. For the AR.Drone 1 none are known.
+requesting them. The stamps in PaVE headers are the drone's own time in 32-bit milliseconds (``video_encapsulation.h``
+in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. The intrinsics
+for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch) for 640×360 images; other
+drones differ by a few per cent. None are known for the AR.Drone 1.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone sends one at a time. Intrinsics in the address apply to the front one."""
+    """Return both cameras; the drone sends one at a time. Intrinsics in the address apply to the front one."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -112,7 +112,7 @@ class PaveAssembly:
         return self._parser.skipped_bytes
 
     def feed(self, data: bytes, now_ns: int) -> list[Coded]:
-        """Return the frames that these bytes complete. Never raises, whatever the content."""
+        """Return the frames that these bytes complete. Never raises, regardless of content."""
         return [coded for frame in self._parser.feed(data) for coded in self._greet(frame, self._coded(frame, now_ns))]
 
     def end(self) -> None:
@@ -139,10 +139,10 @@ class PaveAssembly:
 
 
 CONNECT_S: Final = 1.0  #: connection timeout
-POLL_S: Final = 0.1  #: longest time that a read waits
-SILENT_S: Final = 3.0  #: the connection is closed if no complete frame arrives for this long
+POLL_S: Final = 0.1  #: maximum time that a read blocks
+SILENT_S: Final = 3.0  #: time without a complete frame after which the connection is closed
 KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
-WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1; any small datagram starts the video and keeps it running
+WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1: any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
 
 
@@ -224,13 +224,13 @@ def open_stream(version: int, host: str, port: int, connection: int, clock: Cloc
 
 def _give_up_if_silent(silent_ns: int) -> None:
     if silent_ns > nanoseconds(SILENT_S):
-        raise TimeoutError(f"no frame came for {SILENT_S:g} s")
+        raise TimeoutError(f"no frame arrived for {SILENT_S:g} s")
 
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: a number further back than this means that the drone restarted, not that the image is late
-OLD_RUN: Final = 4  #: this many consecutive images older than the newest also mean that the drone restarted
+REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger one means a restart
+OLD_RUN: Final = 4  #: number of consecutive images older than the newest that also means a restart
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
@@ -259,7 +259,7 @@ class PaveVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes MPEG-4 and H.264."""
         frame = coded.data
         if not isinstance(frame, PaveFrame):
-            raise TypeError("expected a frame of an AR.Drone 2")
+            raise TypeError("expected a frame from an AR.Drone 2")
         if frame.codec not in _DECODED:
             raise UnsupportedError(
                 f"the drone sends video in codec {_codec_name(frame.codec)}, which is not supported: "
@@ -290,7 +290,7 @@ class UvlcVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes UVLC, not P264."""
         packet = coded.data
         if not isinstance(packet, bytes):
-            raise TypeError("expected a datagram of an AR.Drone 1")
+            raise TypeError("expected a datagram from an AR.Drone 1")
         if is_p264(packet):
             raise UnsupportedError(
                 "the drone sends video in P264, which is not supported: set video:video_codec to UVLC (32)"
@@ -374,7 +374,7 @@ class VideoReceiver(LiveVideo):
         clock: Clock = monotonic_ns,
     ) -> None:
         if version not in (1, 2):
-            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
+            raise UsageError(f"the AR.Drone's version must be 1 or 2, got {version}")
 
         super().__init__(
             f"{host}:{port}",

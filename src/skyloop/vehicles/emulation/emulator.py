@@ -1,4 +1,4 @@
-"""What every emulator runs on: its thread, its ports (UDP with faults, TCP for one client), and its life cycle."""
+"""The base of every emulator: its thread, its ports (UDP with faults, TCP for one client), and its life cycle."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Loop:
             _log.exception("the emulated firmware raised an error and continues")
 
     def _wake(self) -> None:
-        with suppress(OSError):  # a full pipe: the loop is already awake
+        with suppress(OSError):  # the pipe is full, so the loop is already awake
             self._waker.send(b"\0")
 
     def _empty(self) -> None:
@@ -120,12 +120,12 @@ class Loop:
 Address = tuple[str, int]
 
 MAX_DATAGRAM: Final = 65_507
-_MOST_AT_ONCE: Final = 64  # datagrams read before other callbacks run
-_SEND_BUFFER: Final = 1 << 20  # bytes, with room for an AR.Drone 1's images
+_MOST_AT_ONCE: Final = 64  # number of datagrams read before other callbacks run
+_SEND_BUFFER: Final = 1 << 20  # size in bytes; large enough for an AR.Drone 1's images
 
 
 class DatagramPort:
-    """A UDP port that replies to the address each datagram came from. Used on the loop's thread."""
+    """A UDP port that replies to the address each datagram came from. Use only on the loop's thread."""
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class DatagramPort:
         for _ in range(_MOST_AT_ONCE):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
-            except OSError:  # no more datagrams, or a reply that could not be delivered
+            except OSError:  # there are no more datagrams, or a reply could not be delivered
                 return
             for each, address in self._inward.items((datagram, sender)):
                 self._later(partial(self._on_datagram, each, address))
@@ -209,7 +209,7 @@ _BUFFER: Final = 1 << 16
 class ByteServer:
     """Serves one client at a time. Meanwhile the next one waits in the kernel's backlog, connected but unanswered.
 
-    Used on the loop's thread.
+    Use only on the loop's thread.
     """
 
     def __init__(
@@ -285,7 +285,7 @@ class Closable(Protocol):
 
 
 class RunningEmulator(ABC):
-    """Firmware that runs from its construction to :meth:`stop`, which a constructor that fails half-way calls too.
+    """Firmware that runs from its construction to :meth:`stop`, which is also called if the constructor fails halfway.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
     read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, which its
@@ -339,7 +339,7 @@ class RunningEmulator(ABC):
             self._loop.post(partial(self._crashed, occurrence.text))
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate or 0."""
+        """Return the frame rate at which to render this camera: its full rate or 0."""
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
@@ -355,7 +355,7 @@ class RunningEmulator(ABC):
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 
-LONGEST_DELAY_S: Final = 10.0  #: greatest delay that can be configured for datagrams
+LONGEST_DELAY_S: Final = 10.0  #: maximum delay that can be configured for datagrams
 NO_FAULTS: Final = Faults()
 
 R = TypeVar("R", bound=RunningEmulator)
@@ -372,7 +372,7 @@ class Emulator(ABC, Generic[R]):
     def start(self) -> None:
         """Switch the firmware on. Everything except its ports is reset."""
         if self._running is not None:
-            raise UsageError("this firmware is started already")
+            raise UsageError("this firmware is already running")
         self._running = self._switched_on()
 
     def stop(self) -> None:
@@ -404,5 +404,5 @@ class Emulator(ABC, Generic[R]):
 def checked_delay(delay_s: float) -> float:
     """Return the delay [s]; raise :class:`UsageError` unless it is from 0 to :data:`LONGEST_DELAY_S`."""
     if not 0 <= delay_s <= LONGEST_DELAY_S:
-        raise UsageError(f"a delay is from 0 to {LONGEST_DELAY_S:g} s, not {delay_s!r}")
+        raise UsageError(f"delay_s must be from 0 to {LONGEST_DELAY_S:g} s, got {delay_s!r}")
     return delay_s

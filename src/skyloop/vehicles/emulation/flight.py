@@ -62,7 +62,7 @@ LIMITS: Final = Limits(
 )
 PLACE_GAIN_PER_S: Final = 0.9  #: speed per metre of distance from a position
 YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per radian of heading error
-YAW_RATE_RAD_S: Final = 1.5  #: greatest yaw rate while turning to a heading
+YAW_RATE_RAD_S: Final = 1.5  #: maximum yaw rate while turning to a heading
 GO_M_S: Final = 3.0  #: default horizontal speed towards a position
 SINK_M_S: Final = 1.5  #: default rate of climb and descent towards a position
 HEADROOM_M: Final = 1.0  #: clearance kept below the ceiling
@@ -117,7 +117,7 @@ class FlightControl:
 
     @property
     def highest_m(self) -> float:
-        """The greatest height that the vehicle can reach; a climb to a greater one would never end."""
+        """The maximum height that the vehicle can reach; a climb beyond it would never end."""
         return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
 
     @property
@@ -186,7 +186,7 @@ class FlightControl:
         self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
 
     def level_thrust(self) -> None:
-        """Start flying by thrust from the present climb rate."""
+        """Start flying by thrust with the current climb rate."""
         self._sinking = self.velocity[2]
 
     def yaw_rate_to(self, yaw: float) -> float:
@@ -195,8 +195,8 @@ class FlightControl:
 
     def _fly(self, action: AnyAction) -> None:
         if not action.finite:
-            action = Hover()  # ignore numbers that are not finite
+            action = Hover()  # numbers that are not finite are ignored
         if self.vehicle.state is FlightState.LANDING:
-            self.lift_off()  # how the vehicle aborts a landing
+            self.lift_off()  # this makes the vehicle abort a landing
         if self.airborne:
             self.vehicle.command(action)

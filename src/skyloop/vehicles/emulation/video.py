@@ -30,7 +30,7 @@ class VideoSettings(Protocol):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The main camera, followed by the one inset into its images, if any."""
+        """The main camera and, if another camera's image is inset into its own, that camera."""
 
     @property
     def inset(self) -> tuple[int, int]:
@@ -200,8 +200,8 @@ class Encoded:
 class Encoder:
     """Encodes one stream with a key frame every ``group`` images.
 
-    ``buffer_s`` is the size of the rate control's buffer, in seconds of the bitrate; None to let images have any size.
-    Raises :class:`MissingExtraError` if PyAV is not installed.
+    ``buffer_s`` is the size of the rate control's buffer, in seconds of the bitrate; if None, image sizes are
+    unlimited. Raises :class:`MissingExtraError` if PyAV is not installed.
     """
 
     def __init__(
@@ -238,7 +238,7 @@ class Encoder:
         self._count = 0
 
     def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
-        """Encode an image: BGR, uint8, shape (height, width, 3), of any size. None if the encoder returned nothing."""
+        """Encode an image: BGR, uint8, shape (height, width, 3), any size; return None if the encoder has no output."""
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")

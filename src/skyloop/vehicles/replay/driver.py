@@ -31,7 +31,7 @@ class ReplayDriver(Driver):
     """
 
     shared = False
-    parameters_without_authority = NAMES  # they control only the replay, not a flight
+    parameters_without_authority = NAMES  # these control only the replay, not a flight
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -100,7 +100,7 @@ class ReplayDriver(Driver):
     def _open_steps(self, source: ReplaySource, sink: Sink) -> None:
         if self.clock is None:
             raise UsageError(
-                f'{self.uri}: speed=max is in step with one application: call skyloop.connect("{self.uri}") there, '
+                f'{self.uri}: speed=max runs in step with one application: call skyloop.connect("{self.uri}") there, '
                 "or give a number, such as speed=10, to serve any client"
             )
         self._playback = Playback(source.seconds, in_step=True)
@@ -143,7 +143,7 @@ MAX: Final = "max"
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """A parsed address."""
+    """The contents of a parsed ``replay://`` address."""
 
     path: Path
     drone: str | None  #: the drone's name in the recording; None for the first drone
@@ -158,7 +158,7 @@ def options_of(uri: VehicleUri) -> ReplayOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")
+        raise UsageError(f"{uri} names no file; it should look like replay:///home/me/flight.mcap?speed=2")
     stepped = uri.options.get("speed") == MAX
     options = ReplayOptions(
         path=expand(uri.reveal_place()),

@@ -36,7 +36,7 @@ from skyloop.vehicles.replay.source import Moment, ReplaySource, TimedSample, Ti
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"
 PAUSED: Final = "replay.paused"
-SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in recorded seconds per second
+SPEEDS: Final = (0.01, 1000.0)  #: minimum and maximum speed, in recorded seconds per second
 NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
 
 _IN_STEP: Final = (
@@ -51,20 +51,20 @@ class Wanted:
 
     paused: bool
     speed: float
-    position_s: float | None = None  #: where to seek to; None to continue from the present position
+    position_s: float | None = None  #: position to seek to; None to continue from the current one
 
 
 class Playback:
     """A replay's position, speed and pause. Thread-safe.
 
-    With ``in_step`` (``speed=max``) its application advances it, and no parameter can be written.
+    With ``in_step`` (``speed=max``), the application advances the replay and no parameter can be written.
     """
 
     def __init__(self, duration_s: float, speed: float = 1.0, *, in_step: bool = False) -> None:
         self.duration_s = duration_s
         self.position_s = 0.0  #: position in the recording, set by the player
         self.over = False  #: whether the end has been reached, set by the player
-        self.jumps = 0  #: number of changes in position other than by playing, set by the player
+        self.jumps = 0  #: number of changes in position other than by playing
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -113,7 +113,7 @@ class Playback:
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter, which takes effect at once; return the value in force.
+        """Write a parameter, which takes effect at once, and return its new value.
 
         Resuming at the end starts the replay over.
         """
@@ -123,13 +123,13 @@ class Playback:
             raise ParameterError(f"{name} can't be written: {_IN_STEP}", code=Refusal.READ_ONLY)
         if name == PAUSED:
             if not isinstance(value, bool):
-                raise ParameterError(f"{name} is true or false, not {value!r}", code=Refusal.WRONG_TYPE)
+                raise ParameterError(f"{name} must be true or false, got {value!r}", code=Refusal.WRONG_TYPE)
             at_end = (self.over or self.position_s >= self.duration_s) and self._wanted.position_s is None
             self._want(paused=value, position_s=0.0 if at_end and not value else None)
             return value
         low, high = (0.0, self.duration_s) if name == POSITION else SPEEDS
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+            raise ParameterError(f"{name} must be from {low:g} to {high:g}, got {value!r}", code=Refusal.OUT_OF_RANGE)
         if name == POSITION:
             self._want(position_s=float(value))
         else:
@@ -137,7 +137,7 @@ class Playback:
         return float(value)
 
     def stop(self) -> None:
-        """End the player."""
+        """Stop the player."""
         self.stopped = True
         self._changed.set()
 
@@ -156,7 +156,7 @@ class Playback:
         """Return what the player should do now; each position is returned only once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
-            if wanted.position_s is not None:  # the writer may read it back before that moment is shown
+            if wanted.position_s is not None:  # the client that wrote it may read it back before that moment is shown
                 self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()
@@ -175,8 +175,8 @@ class Playback:
 
 # Publishing ----------------------------------------------------------------------------------------------------------
 
-#: Events from the vehicle itself. All others came from the recorded proxy or an application, and a client must not
-#: mistake them for events about its own authority or commands.
+#: Events from the vehicle itself. All others came from the recorded proxy or an application, and clients must not
+#: mistake them for events about their own authority or commands.
 _VEHICLES_OWN: Final = frozenset({EventKind.COLLISION, EventKind.VEHICLE_MESSAGE, EventKind.DRIVER_ERROR})
 #: Events that the replay's own proxy emits itself.
 _PROXYS_OWN: Final = frozenset({EventKind.STATE_CHANGED, EventKind.VEHICLE_LINK})
@@ -201,7 +201,7 @@ class ReplayPublisher:
         self._playback = playback
         self._first_ns = first_ns
         self._link = LinkState.CONNECTING
-        self._newest_ns: dict[str, int] = {}  # by camera: capture times never go backwards, not even between passes
+        self._newest_ns: dict[str, int] = {}  # newest capture time by camera, which never goes backwards
         self._command: dict[str, Value] = {}
 
     def link(self, state: LinkState, reason: str = "") -> None:
@@ -233,7 +233,7 @@ class ReplayPublisher:
         """Return a function that publishes a moment's state and images with a common capture time.
 
         It may be called repeatedly while the replay is paused; each image is decoded only once. The moment's command
-        and parameters are in force from now on.
+        and parameters become the current ones.
         """
         self._command = {} if moment.command is None else described(moment.command)
         for parameter in moment.parameters:
@@ -254,7 +254,7 @@ class ReplayPublisher:
         return publish
 
     def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
-        """Publish the vehicle's part unchanged with this position, and the recorded proxy's as native telemetry."""
+        """Publish the vehicle's part with this position, otherwise unchanged, and the proxy's as native telemetry."""
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
         playback = self._playback
@@ -294,7 +294,7 @@ class ReplayPublisher:
         show(self._captured(picture.camera, picture.header.captured_ns, timeline))
 
     def _decoded(self, picture: Picture) -> Callable[[int], None]:
-        """Decode an image; return a function that publishes it with a given capture time. Damage becomes an event."""
+        """Decode an image; return a function that publishes it with a given capture time or, if damaged, an event."""
         try:
             pixels, encoding = picture.as_recorded()
         except SkyloopError as error:
@@ -348,7 +348,7 @@ HEARTBEAT_NS: Final = 50_000_000  #: time between repeats of the first state whi
 PAUSE_NS: Final = 50_000_000  #: pause between two passes, on the replay's clock
 STILL_NS: Final = 200_000_000  #: time between repeats of the moment shown while paused
 IDLE_S: Final = 3600.0  #: time-out of a wait that normally ends only with a change
-LATE_NS: Final = 250_000_000  #: if further behind than this, postpone the schedule instead of rushing through it
+LATE_NS: Final = 250_000_000  #: lag beyond which the schedule is postponed instead of rushed through
 
 
 class Player:
@@ -377,7 +377,7 @@ class Player:
         self._timeline = Timeline(playback.speed, source.begin_ns, clock())
         self._samples = source.samples()
         self._due: TimedSample | None = None  # the next sample, if a written parameter interrupted playing
-        self._still: Callable[[], None] | None = None  # publishes the moment shown while paused
+        self._still: Callable[[], None] | None = None  # publishes the moment that is shown while paused
         self._damaged = 0  # number of damaged frames in earlier passes
 
     def run(self, wait_for: tuple[str, ...]) -> None:
@@ -518,7 +518,7 @@ class StepPlayer:
         self._next = next(self._samples, None)
 
     def step(self) -> None:
-        """Publish the next sample, whose time has come. After the last one, close the link."""
+        """Publish the next sample, whose time has come. After the last sample, close the link."""
         sample = self._next
         if sample is None:
             raise UsageError("the recording is over")

@@ -17,10 +17,10 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.plain import Course, shifted
 from skyloop.recording.reader import Item, Recording
 
-#: Channels that are replayed. Annotations and logs are not: applications create new ones.
+#: Channels that are replayed. Annotations and logs are not replayed, because applications create new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
-_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance equally within this tolerance were not reset
+_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: tolerance within which two clocks that were not reset advance equally
 Sample = Feedback | Picture | Event | Applied | Parameter
 
 
@@ -37,10 +37,10 @@ class Moment:
     """A drone's state at a given time in its recording, and the samples that follow."""
 
     at_ns: int
-    state: Feedback | None = None  #: the state at the capture of the images; the newest one if there are no images
+    state: Feedback | None = None  #: state when the images were captured, or the newest one if there are no images
     pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
-    parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before
+    parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before the moment
     following: Iterator[TimedSample] = field(default_factory=lambda: iter(()))
 
     def shows(self, cameras: list[str]) -> bool:
@@ -50,7 +50,7 @@ class Moment:
 
 
 #: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
-#: has an image. A camera that was silent for longer shows nothing.
+#: has an image. A camera with no image in them shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
 _KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
 
@@ -102,7 +102,7 @@ class ReplaySource:
 
     @property
     def damaged(self) -> list[str]:
-        """Readable descriptions of the unreadable parts."""
+        """Descriptions of the unreadable parts."""
         cut = self._recording.cut
         return [*([f"the file was cut off: {cut}"] if cut else []), *self._recording.damaged]
 
@@ -118,7 +118,7 @@ class ReplaySource:
     def samples(self) -> Iterator[TimedSample]:
         """Yield all samples in order of arrival; their times never go backwards."""
         for sample in self._timed(0):
-            if isinstance(sample.value, Parameter):  # earlier parameters are still in force
+            if isinstance(sample.value, Parameter):  # earlier parameters still apply
                 yield TimedSample(max(sample.at_ns, self.begin_ns), sample.value)
             elif sample.at_ns >= self.begin_ns:
                 yield sample
@@ -127,7 +127,7 @@ class ReplaySource:
 
     def _timed(self, log_ns: int) -> Iterator[TimedSample]:
         """Yield the samples received at the given log time or later."""
-        resets = self._resets if log_ns else []  # when reading from the beginning, they are found on the way
+        resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found on the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
         course = Course(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
@@ -147,7 +147,7 @@ class ReplaySource:
             return []
         passed_ns = last.value.published_ns - first.value.published_ns
         if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
-            return []  # to avoid reading the whole file
+            return []  # avoids reading the whole file
         found, course = [], Course()
         for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
             before_ns = course.shift_ns
@@ -193,7 +193,7 @@ _NEVER_NS: Final = 1 << 63
 
 
 def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
-    """Return the state at the capture of the newest image, so that the two match."""
+    """Return the state when the newest image was captured, so that state and image match."""
     if not states:
         return None
     newest_ns = max(state.captured_ns for state in states)
@@ -204,7 +204,7 @@ def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> 
 def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
     """Return the capabilities of a replay.
 
-    It has the cameras whose frames were recorded. It accepts every command if the recorded vehicle accepted any,
+    Its cameras are those with recorded frames. It accepts every command if the recorded vehicle accepted any,
     natively or through the software autopilot.
     """
     was = drone.described

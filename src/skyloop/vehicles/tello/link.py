@@ -15,7 +15,7 @@ from skyloop.messages import AnyAction
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 
-_BUFFER: Final = 1 << 20  # half a second of video
+_BUFFER: Final = 1 << 20  # size that holds half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
@@ -41,7 +41,7 @@ def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.soc
         if error.errno == errno.EADDRINUSE:
             raise OSError(
                 error.errno,
-                f"UDP port {port} of {local} is in use: stop the other program, or see docs/tello.md for more drones",
+                f"UDP port {port} on {local} is in use: stop the other program, or see docs/tello.md for more drones",
             ) from error
         raise
     return made
@@ -59,7 +59,7 @@ def _through(options: TelloOptions) -> socket.socket:
     return made
 
 
-ASK_S: Final = 0.95  #: a command that gets no reply within this time fails
+ASK_S: Final = 0.95  #: time within which a command must get a reply
 
 
 class TelloLink(VehicleLink[TelloSession]):
@@ -69,7 +69,7 @@ class TelloLink(VehicleLink[TelloSession]):
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
     ) -> None:
         super().__init__("skyloop-tello", session, deliver, clock)
-        self.addresses: tuple[str, str] | None = None  #: the drone's address, and this host's on the route to it
+        self.addresses: tuple[str, str] | None = None  #: addresses of the drone, and of this host on the route to it
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
 
@@ -88,7 +88,7 @@ class TelloLink(VehicleLink[TelloSession]):
     def _open_sockets(self) -> None:
         options = self.session.options
         with self.lock:
-            self._close_sockets()  # first, because the new socket for state needs the same port
+            self._close_sockets()  # done first, because the new socket for state needs the same port
         address = self._lookup.address(options.host)
         commands = command_socket(options, address)
         local = str(commands.getsockname()[0])

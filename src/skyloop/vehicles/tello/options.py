@@ -27,14 +27,14 @@ KNOWN: Final = {
 class VelocityAxes(StrEnum):
     """Possible axes of the drone's ``vgx`` and ``vgy``, which the SDK's guides do not specify."""
 
-    START = "start"  #: x along the heading at switch-on
-    BODY = "body"  #: x along its nose
-    NONE = "none"  #: values not used, so that feedback has no velocity
+    START = "start"  #: x along the heading when switched on
+    BODY = "body"  #: x along the drone's nose
+    NONE = "none"  #: ignore the values, so that feedback has no velocity
 
 
 @dataclass(frozen=True, slots=True)
 class TelloOptions:
-    """A parsed address."""
+    """The contents of a parsed ``tello://`` address."""
 
     host: str
     local: str | None = None  #: this host's address for sending and receiving
@@ -57,7 +57,7 @@ def options_of(uri: VehicleUri) -> TelloOptions:
     """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")
+        raise UsageError(f"{uri} names no host; it should look like tello://192.168.10.1")
     if not _HOST.match(uri.place):
         hint = "; the port is given as an option: ?port=8889" if ":" in uri.place else ""
         raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")

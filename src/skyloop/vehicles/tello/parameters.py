@@ -156,7 +156,7 @@ class DroneSettings:
         return str(self._values[CAMERA])
 
     def parameters(self) -> list[Parameter]:
-        """Return all parameters with their present values."""
+        """Return all parameters with their current values."""
         with self._link.lock:
             session = self._link.session
             setpoints, sdk, serial = session.setpoints, session.sdk, session.serial
@@ -168,7 +168,7 @@ class DroneSettings:
         return [*scales, flip_parameter(self._flip), *kept, *reported_parameters(sdk, serial)]
 
     def write(self, name: str, value: Value) -> Value:
-        """Write a parameter and return the value in force. Takes up to 0.95 s.
+        """Write a parameter and return the value in force afterwards. Takes up to 0.95 s.
 
         Raises an error for a wrong name or value, for a flip on the ground, or if the drone refuses or does not reply.
         """
@@ -200,7 +200,7 @@ class DroneSettings:
             with self._link.lock:
                 session = self._link.session
                 if session.setpoints.stop.active or not session.setpoints.watch.in_air:
-                    raise ParameterError("a flip is for a drone in the air: take off first", code=Refusal.WRONG_STATE)
+                    raise ParameterError("a flip needs a drone in the air: take off first", code=Refusal.WRONG_STATE)
                 session.flip(FLIPS[str(value)])
         self._flip = str(value)
         return value
@@ -211,7 +211,7 @@ class DroneSettings:
         name = setting.parameter.name
         if reply is None:
             raise ParameterError(
-                f"{name}: the drone did not answer {command!r}; it answers nothing while it takes off or lands",
+                f"{name}: the drone did not answer {command!r}; it does not reply while taking off or landing",
                 code=Refusal.DRIVER_FAILED,
             )
         if is_error(reply):

@@ -26,7 +26,7 @@ from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
 from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: time allowed for a reply; real drones take at most 29 ms over a good link
-TRIES: Final = 3  #: how many times a request is sent before it fails
+TRIES: Final = 3  #: number of times a request is sent before it fails
 MOTION_NS: Final = nanoseconds(20.0)  #: time allowed for the reply to a take-off or landing
 
 #: Called with the reply, or None if there was none.
@@ -124,14 +124,14 @@ class Conversation:
 
 TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
-DEGRADED_NS: Final = nanoseconds(0.6)  #: silence after which the link is DEGRADED; state arrives ten times per second
-LOST_NS: Final = nanoseconds(1.5)  #: silence after which the link is LOST
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+DEGRADED_NS: Final = nanoseconds(0.6)  #: time without state after which the link is DEGRADED; it arrives at 10 Hz
+LOST_NS: Final = nanoseconds(1.5)  #: time without state after which the link is LOST
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
-ALONE_NS: Final = nanoseconds(30.0)  #: a drone without commands has landed by then, having begun after 15 s
+ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without commands lands; it begins to after 15 s
 ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
-DEAF: Final = 2  #: consecutive unanswered requests that mean our commands are not being received
+DEAF: Final = 2  #: number of consecutive unanswered requests that means our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
 ALIVE: Final = "wifi?"
 DEFAULT_HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
@@ -143,8 +143,8 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 class TelloSession(VehicleSession):
     """The protocol between an open driver and its drone. Not thread-safe.
 
-    ``extra`` returns further telemetry for ``Feedback.native``, ``video_ns`` when usable video or a key frame last
-    arrived, 0 if never.
+    ``extra`` returns further telemetry for ``Feedback.native``, and ``video_ns`` the time when usable video or a key
+    frame last arrived (0 if never).
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
@@ -166,12 +166,12 @@ class TelloSession(VehicleSession):
         self.sdk: Sdk | None = None  #: None until there is a reply to ``sdk?``; SDK 1.3 replies with an error
         self.serial = ""
         self.ready = False  #: whether state arrives and commands are answered
-        self.remembered: dict[str, str] = {}  #: the command that last set each parameter, for a link loss
+        self.remembered: dict[str, str] = {}  #: last command for each parameter, to be resent after a link loss
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
-        self._lost_ns = self._sent_ns = now_ns  # when the link was lost or hovering requested later; last datagram
+        self._lost_ns = self._sent_ns = now_ns  # time of the link loss or of a later hover request; last datagram
         self._alive_ns = self._found_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
@@ -180,7 +180,7 @@ class TelloSession(VehicleSession):
         self._rc_ns = 0
         self._flips: list[str] = []
         self._reported_ports = False
-        self._answered = False  # whether there was a reply while no state arrives
+        self._answered = False  # whether there has been a reply since state last arrived
         self.local = ""  #: this host's address on the route to the drone
         self._place = f"{options.host}, UDP port {options.port}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
@@ -226,7 +226,7 @@ class TelloSession(VehicleSession):
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_state(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the state port. Never raises, whatever the content."""
+        """Handle a datagram from the state port. Never raises, regardless of content."""
         try:
             state = parse(datagram)
         except DecodeError:
@@ -255,7 +255,7 @@ class TelloSession(VehicleSession):
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the command port. Never raises, whatever the content."""
+        """Handle a datagram from the command port. Never raises, regardless of content."""
         reply = decoded(datagram)
         if not reply:
             self.counts["damaged"] += 1
@@ -335,7 +335,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
-        """Return whether to send no requests, because each delays the automatic landing of a drone without a pilot."""
+        """Return whether to withhold requests, because each delays the automatic landing of a drone without a pilot."""
         asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
         return asked and self.setpoints.flown_by_others
 

@@ -1,6 +1,6 @@
-"""Turning set-points into sticks and motions. The last action is kept until the state shows that it is done. Pure.
+"""Convert set-points to sticks and motions. The last action is kept until the state shows that it is done. Pure.
 
-Replies are not relied on: they arrive seconds late or not at all. A take-off or landing is repeated until it shows.
+Replies may arrive seconds late or never, so it repeats a take-off or landing until it takes effect.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from skyloop.vehicles.tello.wire import (
     is_error,
 )
 
-FULL_TILT_RAD: Final = 0.2  #: attitude that a full stick stands for; chosen to equal an AR.Drone's tilt indoors
+FULL_TILT_RAD: Final = 0.2  #: attitude commanded by a full stick; chosen to equal an AR.Drone's tilt indoors
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A number for each stick: the effect of a full stick, or the largest set-point."""
+    """One number per stick axis: the effect of a full stick, or the largest set-point."""
 
     speed: float = FULL_SPEED_M_S  #: [m/s]
     climb: float = FULL_CLIMB_M_S  #: [m/s]
@@ -52,7 +52,7 @@ class Scale:
 
 
 def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
-    """Return the sticks, and the set-point that they command: within the limits, and at most a full stick.
+    """Return the stick values and the set-point that they command, within the limits and at most a full stick.
 
     The Tello holds a speed, not an attitude, so a tilt becomes a fraction of the full stick and thus of the full speed.
     """
@@ -83,9 +83,9 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
-AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show by then is repeated
-TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not taken off by then is refusing to
-RISES_NS: Final = nanoseconds(3.0)  #: a take-off may start until this long after it was sent; real drones take 1.1 s
+AGAIN_NS: Final = nanoseconds(1.5)  #: time after which a take-off or landing without visible effect is repeated
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: time after which a drone still on the ground is refusing to take off
+RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which it may begin; real drones take 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
@@ -101,7 +101,7 @@ class Decision(Enum):
 class SetpointController:
     """Stores the last action and turns it into commands.
 
-    ``full`` is the effect of a full stick, ``limits`` the largest set-point.
+    ``full`` is the effect of a full stick, and ``limits`` is the largest set-point.
     """
 
     def __init__(self) -> None:
@@ -109,16 +109,16 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state is arriving
-        #: Set after an abandoned stop or landing until the next command; our silence makes the drone land after 15 s.
+        #: Set after an abandoned stop or landing until the next command: we send nothing, so it lands after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
         self._stick = LEVEL
         self._decided_ns = 0
         self._sent_ns: int | None = None  # when the take-off or landing was sent
-        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
+        self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._state_ns = 0  # when the last state arrived
-        self._was_in_air = False  # according to the last state, or because we have just sent a take-off
+        self._was_in_air = False  # whether the last state said so, or we have just sent a take-off
         self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
         self._events: list[VehicleEvent] = []
 
@@ -142,7 +142,7 @@ class SetpointController:
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return FlightState.LANDING  # because it may be about to rise
+            return FlightState.LANDING  # it may be about to rise
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
         return self.watch.phase
@@ -255,7 +255,7 @@ class SetpointController:
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the reply to a take-off or landing. For an emergency stop, only the motors' state counts."""
+        """Handle the reply to a take-off or landing. For an emergency stop, only the state of the motors matters."""
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused
@@ -301,9 +301,9 @@ class SetpointController:
         return []
 
     def stick(self) -> Stick | None:
-        """Return the sticks for ``rc``, or None not to send any.
+        """Return the stick values for ``rc``, or None to send none.
 
-        That is so if the drone is on the ground, taking off, landing, or flown by another program.
+        This is the case if the drone is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

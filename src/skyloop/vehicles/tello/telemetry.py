@@ -1,8 +1,8 @@
-"""Converting state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
+"""Convert state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
 
 No field in the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` increases by one every
 second only while the motors run, and the distance sensor shows whether the ground is near. Our own commands serve only
-to interpret what is observed: a climb after a take-off command is a take-off.
+to interpret the observations: a climb after a take-off command is a take-off.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 def height_m(state: State) -> float | None:
     """Return the measured height above the surface below [m] or, if there is none, that above the take-off point.
 
-    The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells which.
+    The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells them apart.
     """
     if state.distance_cm is not None:
         on_ground = state.distance_cm <= GROUND_CM and (state.height_cm or 0.0) < GROUND_CM
@@ -85,10 +85,10 @@ def _angle(degrees: float | None) -> float | None:
 
 # The phase of flight -------------------------------------------------------------------------------------------------
 
-STILL_NS: Final = nanoseconds(1.6)  #: the motors are off if the count of seconds pauses for this long
-GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or has not begun yet
-LOW_M: Final = 0.15  #: heights up to this are near the ground
-HIGH_M: Final = 0.25  #: at this height and above, the drone is off the ground
+STILL_NS: Final = nanoseconds(1.6)  #: time without an increase in the count of seconds after which the motors are off
+GRACE_NS: Final = nanoseconds(2.5)  #: time to wait for a count that has just stopped or has not begun yet
+LOW_M: Final = 0.15  #: maximum height that counts as near the ground
+HIGH_M: Final = 0.25  #: minimum height that counts as off the ground
 HOVER_M: Final = 0.4  #: minimum height at the end of a take-off
 SLOW_DM_S: Final = 1.0  #: maximum vertical speed at the end of a take-off
 SETTLED: Final = 3  #: number of consecutive high and slow samples that end a take-off
@@ -117,7 +117,7 @@ class FlightWatch:
 
     @property
     def in_air(self) -> bool:
-        """Whether the drone follows sticks."""
+        """Whether the drone follows stick commands."""
         return self.phase is _S.HOVERING
 
     def motors(self, now_ns: int) -> bool | None:
@@ -166,7 +166,7 @@ class FlightWatch:
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
         """Return whether a landed drone has taken off. Being carried around does not count."""
-        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before landing
+        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before the landing
         if self.rising and (high or (motors and begun)):
             return True
         return bool(high and motors and in_phase_ns > GRACE_NS)
@@ -174,13 +174,13 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: an estimate: users report that somewhat above this the drone refuses to start its motors
-COOL_C: Final = 85.0  #: a hot drone no longer counts as hot below this
+HOT_C: Final = 90.0  #: estimated limit: users report that the drone refuses to start its motors somewhat above this
+COOL_C: Final = 85.0  #: temperature below which a hot drone no longer counts as hot
 PAD_LOST: Final = 5  #: number of consecutive states without a pad after which it counts as out of view
 
 
 class Health:
-    """Reports each change in overheating and in the mission pad in view, once."""
+    """Reports changes in overheating and in the visible mission pad, each once."""
 
     def __init__(self) -> None:
         self._hot = False

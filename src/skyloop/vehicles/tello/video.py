@@ -53,7 +53,7 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone sends one at a time; the downward one needs SDK 3.0.
+    """Return both cameras. The drone sends one at a time; the downward one needs SDK 3.0.
 
     Intrinsics in the address apply to the front camera.
     """
@@ -82,8 +82,8 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
-POLL_S: Final = 0.1  #: longest time that a read waits
-SILENT_S: Final = 3.0  #: the port is reopened if no datagram arrives for this long
+POLL_S: Final = 0.1  #: maximum time that a read blocks
+SILENT_S: Final = 3.0  #: time without a datagram after which the port is reopened
 BURST: Final = 64  #: maximum number of datagrams per read
 
 
@@ -117,7 +117,7 @@ class VideoStream:
         if wait_readable(self._socket, POLL_S):
             self._drain(frames)
         if self._clock() - self._received_ns > nanoseconds(SILENT_S):
-            raise TimeoutError(f"no video came for {SILENT_S:g} s")
+            raise TimeoutError(f"no video arrived for {SILENT_S:g} s")
         return frames
 
     def close(self) -> None:
@@ -179,7 +179,7 @@ class TelloVideo:
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         unit = coded.data
         if not isinstance(unit, AccessUnit):
-            raise TypeError("expected a picture of a Tello")
+            raise TypeError("expected an image from a Tello")
         came, self._came = self._came, unit.number
         left_out = came is not None and unit.number != came + 1
         if unit.is_key:

@@ -1,12 +1,12 @@
 """The Ryze Tello's text protocol: commands, replies, state and video. Pure.
 
-Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". What SDK 3.0 (Tello Talent, and EDU with newer firmware)
-adds is known from the commands that djitellopy sends.
+Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". The additions in SDK 3.0 (Tello Talent, and EDU with
+newer firmware) are known from the commands that djitellopy sends.
 
 A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
-only if it has the form of that command's replies.
+only if it has the format of that command's replies.
 
-State arrives ten times per second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
+State arrives ten times per second; unknown values are None. Axes follow aviation: x forward, y right, z down;
 positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm this for both
 attitude and acceleration: a Tello that reports a pitch of 8° reports 0.116 g along x.
 
@@ -30,15 +30,15 @@ PORT: Final = 8889  #: the Tello's port for commands; it replies to the sender's
 STATE_PORT: Final = 8890  #: the client's port for state
 VIDEO_PORT: Final = 11111  #: the client's port for video
 HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
-SILENCE_S: Final = 15.0  #: the Tello lands after this time without a command
+SILENCE_S: Final = 15.0  #: time without a command after which the Tello lands
 
 ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100
-#: Effect of a stick of 100. An estimate: no guide specifies it; users take ``rc`` to be in cm/s and degrees per second.
+#: Effect of a stick at 100; an estimate, because no guide gives it. Users take ``rc`` to be in cm/s and degrees/s.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: characters; all commands and replies in the SDK are much shorter
+MAX_COMMAND: Final = 256  #: length in characters; all commands and replies in the SDK are much shorter
 
 
 class Sdk(StrEnum):
@@ -90,7 +90,7 @@ _ERROR: Final = re.compile(r"(error|unknown command|out of range|unactive|forced
 
 
 class Shape(Enum):
-    """Forms of replies other than errors."""
+    """Formats of replies other than errors."""
 
     OK = re.compile(r"ok\Z", re.IGNORECASE)
     NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
@@ -119,7 +119,7 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Return the form of a command's reply."""
+    """Return the format of a command's reply."""
     return READ.get(command, Shape.OK)
 
 
@@ -129,7 +129,7 @@ def is_error(reply: str) -> bool:
 
 
 def answers(reply: str, command: str) -> bool:
-    """Return whether this reply can belong to this command, being an error or of the right form."""
+    """Return whether a reply can belong to a command: it is an error or has the right format."""
     if reply.lower().startswith("unknown command"):
         named = reply.partition(":")[2].strip()
         return named in ("", command)
@@ -140,7 +140,7 @@ MAX_STATE: Final = 1024
 FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
 GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, which is its minimum
-NO_PAD: Final = -1  #: pad number if none is in view (-2 if detection is off)
+NO_PAD: Final = -1  #: pad number while none is in view (-2 if detection is off)
 NOWHERE_CM: Final = -100  #: value of each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
 
@@ -168,8 +168,8 @@ class State:
     distance_cm: float | None = None  #: ``tof``: distance to the surface below
     height_cm: float | None = None  #: height above the take-off point; may be negative
     battery_percent: float | None = None
-    barometer: float | None = None  #: as sent; the zero point and unit differ between versions
-    motor_s: int | None = None  #: total running time of the motors since switch-on
+    barometer: float | None = None  #: reading as sent; its zero point and unit differ between versions
+    motor_s: int | None = None  #: total running time of the motors since the drone was switched on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None
     pads: bool = False  #: whether there are fields for pads
@@ -182,11 +182,11 @@ def parse(datagram: bytes) -> State:
     The last field of a truncated string is dropped, unless its semicolon is present.
     """
     if len(datagram) > MAX_STATE:
-        raise DecodeError(f"a state string of {len(datagram)} bytes; the Tello's have less than {MAX_STATE}")
+        raise DecodeError(f"the state string has {len(datagram)} bytes; a Tello's has at most {MAX_STATE}")
     try:
         text = datagram.decode("ascii")
     except UnicodeDecodeError:
-        raise DecodeError("a state string with bytes that are not ASCII") from None
+        raise DecodeError("the state string has bytes that are not ASCII") from None
     fields: dict[str, float | Vector] = {}
     for part in text.strip("\r\n\0 ").split(";")[:FIELDS]:
         match = _FIELD.match(part)
@@ -198,7 +198,7 @@ def parse(datagram: bytes) -> State:
         elif len(numbers) == 3 and all(map(math.isfinite, numbers)):
             fields[match[1]] = (numbers[0], numbers[1], numbers[2])
     if not fields:
-        raise DecodeError(f"no field of a state string in {datagram[:40]!r}")
+        raise DecodeError(f"no state field in {datagram[:40]!r}")
     return _state(fields)
 
 
@@ -235,7 +235,7 @@ PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 or 0 if none is in view, for which some firmware sends 257
+    if number is None or number not in PADS:  # -1 or 0 if none is in view; some firmware then sends 257
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -247,8 +247,8 @@ def build(fields: list[tuple[str, str]]) -> bytes:
     return ("".join(f"{name}:{value};" for name, value in fields) + "\r\n").encode("ascii")
 
 
-PIECE: Final = 1460  #: bytes in every datagram of an image except the last one
-MAX_PICTURE: Final = 1 << 19  #: bytes; real images have a fiftieth of that
+PIECE: Final = 1460  #: size of every datagram of an image except the last [bytes]
+MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real ones have a fiftieth of that
 _SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
@@ -261,7 +261,7 @@ class AccessUnit:
     is_key: bool  #: whether decoding can begin here
     arrived_ns: int  #: when its first piece arrived
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
-    whole: bool  #: whether no piece of this image seems to be missing
+    whole: bool  #: whether the image seems to be complete
     number: int = 0  #: count of images that have arrived
     width: int = 0  #: width according to the newest parameter set [px]; 0 before the first one
     height: int = 0
@@ -273,9 +273,9 @@ def pieces(picture: bytes) -> list[bytes]:
 
 
 class Assembly:
-    """Assembles images from pieces in order of arrival. Never raises, whatever the input.
+    """Assembles images from pieces in order of arrival. Never raises, regardless of input.
 
-    ``stray`` counts bytes that don't belong to any image, ``missing`` the images missing according to stream numbers.
+    ``stray`` counts bytes that don't belong to any image, ``missing`` counts images missing from the stream's numbers.
     """
 
     def __init__(self) -> None:

@@ -55,7 +55,7 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. To learn a file's image size its head is read once; a live camera is not opened."""
+        """Return the camera. A file's head is read once to determine its image size; a live camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
@@ -122,7 +122,7 @@ class VideoDriver(Driver):
         )
 
     def _publish_event(self, sink: Sink, event: VideoEvent, text: str) -> None:
-        """Publish a camera's event, as a link state if it changes that. Runs on either of the camera's threads."""
+        """Publish a camera's event, or the link state that it implies. Runs on either of the camera's threads."""
         if event is VideoEvent.STREAMING:
             self._streams = True
             sink.link(LinkState.UP)
@@ -133,7 +133,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams, which consists only of its counters because nothing is flying."""
+        """Publish feedback while the camera streams. It consists only of counters, because nothing is flying."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))
@@ -183,7 +183,7 @@ class DeviceOptions:
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
-    gain: int | str = ""  #: in the device's own unit, or ``auto``
+    gain: int | str = ""  #: gain in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
         """Set exposure and gain; return a readable text for each failure."""
@@ -208,7 +208,7 @@ class DeviceOptions:
 
 @dataclass(frozen=True, slots=True)
 class VideoOptions:
-    """A parsed address."""
+    """The contents of a parsed ``video://`` address."""
 
     place: str  #: path or address without secrets
     path: Path  #: path of the file
@@ -229,8 +229,8 @@ def options_of(uri: VehicleUri) -> VideoOptions:
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(
-            f"{uri} names no file and no camera: it looks like video:///home/me/flight.mp4, video:///dev/video0 or "
-            f"video://rtsp://192.168.1.10/live; {described(cameras())}"
+            f"{uri} names neither a file nor a camera; it should look like video:///home/me/flight.mp4, "
+            f"video:///dev/video0 or video://rtsp://192.168.1.10/live; {described(cameras())}"
         )
     path, source = _place(uri)
     _check_kind(uri, source)
@@ -266,7 +266,7 @@ def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
 def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
     """Raise an error if the options do not fit the source."""
     if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
-        raise UsageError(f"{uri}: loop and speed are for files, not live cameras")
+        raise UsageError(f"{uri}: loop and speed apply only to files, not to live cameras")
     unfit = {
         "only a device or a stream has": _LIVE if source is None else (),
         "only a device has": _DEVICE if source is None or source.scheme else (),

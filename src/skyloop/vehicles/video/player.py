@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FFmpegError = av.error.FFmpegError
 
 CHUNK: Final = 1 << 16  #: number of bytes per read
-SNIFF: Final = 1 << 18  #: a PaVE stream has a header within this many bytes, wherever it was cut
+SNIFF: Final = 1 << 18  #: number of bytes within which a PaVE stream has a header, wherever it was cut
 DEFAULT_FPS: Final = 30.0  #: frame rate if the file does not specify it
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
@@ -43,9 +43,9 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: Unit | None = None  #: its encoded form, if that is relayed unchanged
+    coded: Unit | None = None  #: the image as encoded, if that is relayed unchanged
     number: int = 0  #: its number in the stream
-    reason: str = ""  #: why its encoded form is not relayed although the stream is
+    reason: str = ""  #: why this image is not relayed although its stream is
     turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
 
 
@@ -65,7 +65,7 @@ def open_file(path: Path) -> Source:
         with path.open("rb") as file:
             head = file.read(SNIFF)
     except OSError as error:
-        if "%" in path.name:  # a pattern for a numbered image sequence, which PyAV supports
+        if "%" in path.name:  # this is a pattern for a numbered image sequence, which PyAV supports
             return ContainerSource(str(path))
         raise UsageError(f"video://{path}: {error.strerror}") from error
     if path.suffix == ".pave" or PaveParser().feed(head):
@@ -79,7 +79,7 @@ class ContainerSource:
     def __init__(self, name: str) -> None:
         self._name = name
         self.damaged = 0  #: number of pieces so far that could not be decoded
-        self.stream = ""  #: ``h264`` if images with this codec can be relayed unchanged, otherwise empty
+        self.stream = ""  #: ``h264`` if images in this codec can be relayed unchanged, otherwise empty
         try:
             self._container: InputContainer = av.open(name)
         except (FFmpegError, OSError, ValueError) as error:
@@ -87,7 +87,7 @@ class ContainerSource:
         videos = self._container.streams.video
         if not videos:
             self._container.close()
-            raise FileFormatError(f"{name} holds no video stream")
+            raise FileFormatError(f"{name} contains no video stream")
         self._stream = videos[0]
         limit_memory(self._stream.codec_context)
         self._stream.thread_type = "AUTO"
@@ -127,7 +127,7 @@ class ContainerSource:
         try:
             yield from self._container.demux(self._stream)
         except (FFmpegError, OSError, ValueError):
-            self.damaged += 1  # a truncated file, in which everything before the cut is usable
+            self.damaged += 1  # the file is truncated, but everything before the cut is usable
 
     def close(self) -> None:
         self._container.close()
@@ -162,7 +162,7 @@ class PaveSource:
         first = next(iter(self._parser_frames()), None)
         if first is None:
             self._file.close()
-            raise FileFormatError(f"{path} holds no frame of a PaVE stream")
+            raise FileFormatError(f"{path} contains no PaVE frame")
         self._file.seek(0)
         self._parser = PaveParser()
         self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS
@@ -194,8 +194,8 @@ Source = ContainerSource | PaveSource
 
 FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
 POLL_S: Final = 0.02  #: time between checks for a viewer
-BEHIND_NS: Final = 250_000_000  #: if further behind than this, restart the schedule instead of rushing to catch up
-GAP_S: Final = 2.0  #: a step between stamps that is longer than this, or backwards, is a cut in the recording
+BEHIND_NS: Final = 250_000_000  #: lag beyond which the schedule restarts instead of rushing to catch up
+GAP_S: Final = 2.0  #: maximum step between stamps; a longer one, or a step back, is a cut in the recording
 
 
 class FilePacer:

@@ -1,6 +1,6 @@
 """Local cameras known to Video4Linux: their formats, exposure and gain.
 
-This module calls the kernel directly. Layouts and numbers come from ``linux/videodev2.h``
+This module makes system calls directly. Layouts and numbers come from ``linux/videodev2.h``
 (``Documentation/userspace-api/media/v4l``) and are the same on all architectures with 32-bit integers. FFmpeg may
 stream from the device at the same time, because settings can be changed independently of a stream.
 """
@@ -111,7 +111,7 @@ class V4l2Device:
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         if ioctl is None:
-            from fcntl import ioctl as kernels  # not available on Windows
+            from fcntl import ioctl as kernels  # this module is not available on Windows
 
             ioctl = kernels
         self._descriptor = descriptor
@@ -155,7 +155,7 @@ class V4l2Device:
         lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
         if not lowest <= exposure_ms <= highest:
             return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
-        self._set(AUTO_EXPOSURE, _MANUAL)  # the control is missing on a device without automatic exposure
+        self._set(AUTO_EXPOSURE, _MANUAL)  # fails, harmlessly, on a device without automatic exposure
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:
@@ -172,7 +172,7 @@ class V4l2Device:
         return self._set(GAIN, gain)
 
     def settings(self) -> list[str]:
-        """Return readable descriptions of exposure and gain: their ranges and present values."""
+        """Return readable descriptions of exposure and gain: their ranges and current values."""
         found = []
         exposure, mode = self.control(EXPOSURE), self.control(AUTO_EXPOSURE)
         if exposure is not None:
@@ -272,7 +272,7 @@ class CameraDevice:
 
 
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
-    """Return the local cameras in order of their numbers; none if the system has no Video4Linux.
+    """Return the local cameras in order of their numbers; an empty list if the system has no Video4Linux.
 
     Of each camera, only the first node is listed, which is the one that captures images.
     """

@@ -319,7 +319,7 @@ def test_ports_in_use_are_refused_without_leaks(drone: ArdroneFirmware) -> None:
     with pytest.raises(LinkError, match="navdata port"):
         ArdroneFirmware(host, ports=drone.ports).start()
     with ArdroneFirmware(host, ports=Ports.free()) as another:
-        with pytest.raises(UsageError, match="started already"):
+        with pytest.raises(UsageError, match="already running"):
             another.start()
         with pytest.raises(UsageError, match="taken already"):
             ArdroneFirmware(host, ports=Ports.free()).start()

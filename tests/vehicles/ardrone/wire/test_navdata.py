@@ -148,7 +148,7 @@ def test_an_option_by_hand() -> None:
         (header(), "16 bytes"),
         pytest.param(RECORDED[:-1], "checksum", marks=needs_recordings),
         (bytes(MAX_DATAGRAM + 1), "4097 bytes"),
-        (with_checksum(b"\x89" + header()[1:]), "begins with"),
+        (with_checksum(b"\x89" + header()[1:]), "must begin with"),
         (with_checksum(header() + b"\x01\x00"), "belong to no option"),
         (with_checksum(header() + struct.pack("<HH", 1, 3)), "does not fit"),
         (with_checksum(header() + struct.pack("<HH", 1, 9) + b"1234"), "does not fit"),

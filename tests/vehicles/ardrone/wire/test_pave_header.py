@@ -95,5 +95,5 @@ def test_built_headers_are_parsed(
 
 
 def test_another_size_is_refused() -> None:
-    with pytest.raises(UsageError, match="64 bytes"):
+    with pytest.raises(UsageError, match="must be 64"):
         build_header(payload_size=1, type=FrameType.P, number=1, timestamp_ms=0, width=640, height=360, header_size=60)

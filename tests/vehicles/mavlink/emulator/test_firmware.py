@@ -82,7 +82,7 @@ def test_ports_in_use_and_invalid_settings_are_refused() -> None:
     firmware = MavlinkFirmware(host(), kind=Kind.PX4, ports=Ports.free(Kind.PX4))
     with pytest.raises(UsageError, match="call start"):
         _ = firmware.autopilot
-    with firmware, pytest.raises(UsageError, match="started already"):
+    with firmware, pytest.raises(UsageError, match="already running"):
         firmware.start()
     firmware.stop()
     with pytest.raises(UsageError, match="no TCP port"):

@@ -113,7 +113,7 @@ def test_a_port_in_use_is_named_and_reused_after_a_restart() -> None:
         host = SimHost(with_tellos(SimOptions(world="empty")))
         with pytest.raises(LinkError, match=r"the drone's command port, UDP 8889 on .* can't be opened"):
             TelloFirmware(host, bind=firmware.settings.bind).start()
-        with pytest.raises(UsageError, match="started already"):
+        with pytest.raises(UsageError, match="already running"):
             firmware.start()
         firmware.stop()
         firmware.start()
@@ -134,8 +134,8 @@ def test_a_free_port_is_kept_after_a_restart() -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"sdk": "4.0"}, "there is SDK 1.3, 2.0, 3.0 of the Tello"),
-        ({"delay_s": 11.0}, "a delay is from 0 to 10 s"),
+        ({"sdk": "4.0"}, "sdk must be one of 1.3, 2.0, 3.0"),
+        ({"delay_s": 11.0}, "delay_s must be from 0 to 10 s"),
         ({"pads": {9: (0.0, 0.0)}}, "mission pads are numbered from 1 to 8"),
     ],
 )

@@ -8,7 +8,7 @@ To use it on free local ports, as in a test::
 
     host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
     with ArdroneFirmware(host, version=2, ports=Ports.free()) as firmware:
-        ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP of version 1), .control (TCP)
+        ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP for version 1), .control (TCP)
         host.simulation.truth(0).position_m  # the vehicle's true position
 
 ``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` drops
@@ -85,8 +85,8 @@ MOST: Final = 8  #: maximum number of recipients of datagrams
 class Listeners:
     """Recipients' addresses, each with its own sequence.
 
-    There are at most :data:`MOST`; one more replaces the one whose last request is the oldest. As with the real drone,
-    requests need not be repeated.
+    There are at most :data:`MOST`; a further one replaces the one that has made no request for longest. As with the
+    real drone, requests need not be repeated.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class Listeners:
 
 
 MOST_CLIENTS: Final = 8  #: maximum number of clients of a TCP port
-MOST_BACKLOG: Final = 256 * 1024  #: bytes queued for one client in addition to the system's buffer
+MOST_BACKLOG: Final = 256 * 1024  #: maximum number of bytes queued for one client in addition to the system's buffer
 _SYSTEM_BUFFER: Final = 64 * 1024
 _READ: Final = 4096
 
@@ -139,7 +139,7 @@ class Outlet:
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece unless the client is too slow; ``starts`` says whether a stream can begin with it."""
+        """Send a piece unless the client is too slow. ``starts``: whether a stream can begin with this piece."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:
@@ -190,7 +190,7 @@ class Outlet:
 
 
 class StreamPort:
-    """A TCP port that sends to its clients and discards what they send. Used on the loop's thread."""
+    """A TCP port that sends to its clients and discards what they send. Use only on the loop's thread."""
 
     def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
         self._loop = loop
@@ -209,7 +209,7 @@ class StreamPort:
         while True:
             try:
                 connection, _ = self._socket.accept()
-            except OSError:  # none pending, or already closed
+            except OSError:  # no connection is pending, or the socket is already closed
                 return
             if len(self.outlets) >= MOST_CLIENTS:
                 connection.close()
@@ -241,7 +241,7 @@ DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 
 
 class RunningFirmware(RunningEmulator):
-    """An AR.Drone that is switched on. Its logic, ports and lists of clients belong to the loop's thread."""
+    """An AR.Drone that is switched on. Use its logic, ports and lists of clients only on the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
@@ -405,7 +405,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads -------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
+        """Return the frame rate at which to render this camera: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self._seen else 0.0
 
 
@@ -425,14 +425,14 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         bind: The local address to listen on.
         ports: The ports to listen on; 0 for any free one.
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
-        delay_s: Added to those datagrams, in each direction.
+        delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
         torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
             client, however old, and then the frames that follow, key frames or not. Otherwise its stream begins with
             the next key frame.
 
     Raises:
-        UsageError: The version or header size does not exist, or the delay is out of range.
+        UsageError: The version or header size is unknown, or the delay is out of range.
         MissingExtraError: A library that renders or encodes images is not installed.
     """
 
@@ -450,9 +450,9 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         torn_start: bool = True,
     ) -> None:
         if version not in VERSIONS:
-            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, but no version {version!r}")
+            raise UsageError(f"the AR.Drone's version must be 1 or 2, got {version!r}")
         if header_size not in (64, 68):
-            raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
+            raise UsageError(f"header_size must be 64 or 68, got {header_size!r}")
         if version > 1:
             require_encoder()
         super().__init__(host, drone)
@@ -460,15 +460,15 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports for a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports the same after a restart
         return running
 
     @property
     def ports(self) -> Ports:
-        """The actual ports, with those that were chosen for 0."""
+        """The actual ports, including those chosen where 0 was given."""
         return self._started.ports
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Use it only on the loop's thread."""
         return self._started.logic

@@ -1,4 +1,4 @@
-"""The drone's configuration: its values per session, user and application, and the dumps that it sends. Pure."""
+"""The drone's configuration: its values per session, user and application, and dumps of them. Pure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skyloop.vehicles.ardrone.wire.configuration import (
     parse_value,
 )
 
-MOST_CUSTOM: Final = 16  #: most sessions, most users and most applications; a real drone's limit is unknown
+MOST_CUSTOM: Final = 16  #: maximum number of sessions, of users and of applications; a real drone's limit is unknown
 
 Ids = tuple[str, str, str]  #: ids of the session, user and application, as in ``CONFIG_IDS``
 
@@ -34,7 +34,7 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: Limits that come in three versions: the one in force, one for indoors and one for outdoors.
+#: Limits that come in three versions: the current one, one for indoors and one for outdoors.
 TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
 #: Values in the emulated firmware (2.4.8 and 1.7.4) that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
@@ -49,7 +49,7 @@ _FACTORY: Final[dict[int, dict[str, Value]]] = {
     2: {"general:num_version_soft": "2.4.8"},
 }
 _CODECS: Final = {1: (VideoCodec.UVLC,), 2: tuple(codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P)}
-_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version: a camera, or a pair of cameras
+_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each channel shows one camera or a pair
 
 
 class Configuration:
@@ -82,13 +82,13 @@ class Configuration:
 
     @property
     def ids(self) -> Ids:
-        """The ids of the session, user and application in force."""
+        """The ids of the current session, user and application."""
         return self._ids[Category.SESSION], self._ids[Category.USER], self._ids[Category.APPLICATION]
 
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
         """Handle a ``CONFIG`` with the ids received immediately before it, if any; return whether it was accepted.
 
-        While a custom session, user or application is in force, only commands with its ids are accepted, except for
+        While a custom session, user or application is active, only commands with its ids are accepted, except for
         ``custom:…_id``: otherwise no other client could ever start a custom one.
         """
         name = name.strip().lower()
@@ -162,7 +162,7 @@ class Configuration:
         return True
 
     def _show_ids(self) -> None:
-        """Write the ids in force into their keys, which belong to the session."""
+        """Write the current ids to their keys, which belong to the session."""
         session = self._values[Category.SESSION][self._ids[Category.SESSION]]
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 

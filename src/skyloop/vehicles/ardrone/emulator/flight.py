@@ -1,4 +1,4 @@
-"""The firmware's flight logic: turns AT commands, silence and battery state into set-points. Pure: no clock.
+"""The firmware's flight logic: turns AT commands, gaps in them and the battery state into set-points. Pure: no clock.
 
 The decisions are those described in the Developer Guide. Flight animations are not modelled: a request is stored and
 navdata reports a flip for its duration, but the vehicle continues to follow its last command.
@@ -25,8 +25,8 @@ from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
-TAKEOFF_ALTITUDE_M: Final = 0.85  #: real drones hover at 0.7 to 1 m after a take-off
-_LEAST_TURNING_SPEED_M_S: Final = 1.0  # a coordinated turn at a lower speed is computed for this one
+TAKEOFF_ALTITUDE_M: Final = 0.85  #: height after a take-off; real drones hover at 0.7 to 1 m
+_LEAST_TURNING_SPEED_M_S: Final = 1.0  # minimum speed with which to compute a coordinated turn
 _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
 
@@ -91,11 +91,11 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: silence before it hovers: general:com_watchdog in the Developer Guide (not checked)
-LOST_AFTER_S: Final = 2.0  #: silence before the link counts as lost
-CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, as no source gives the angle
-BATTERY_RECOVERY_MV: Final = 500  #: how far above vbat_min a battery no longer counts as low; an estimate
-CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate of the calibration's turn, which takes about 4 s; an estimate
+HOVER_AFTER_S: Final = 0.25  #: time without commands before it hovers: general:com_watchdog in the guide (unverified)
+LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
+CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
+BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no longer counts as low; an estimate
+CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn in about 4 s; an estimate
 FIRST_FLIP: Final = 16
 LAST_ANIMATION: Final = 19
 
@@ -168,7 +168,7 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: use the present attitude as level. Refused in the air."""
+        """Handle ``FTRIM``: use the current attitude as level. Refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
@@ -190,7 +190,7 @@ class FlightControl:
         return now_ns < self._calibrating_until_ns
 
     def flipping(self, now_ns: int) -> bool:
-        """Return whether the duration of a requested flip is not over yet."""
+        """Return whether a requested flip is still in progress."""
         return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
 
     # Supervision -----------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ class CommandSequence:
         return True
 
 
-WATCHDOG_S: Final = 0.05  #: silence before the watchdog bit is set: Developer Guide, 7.1.2
+WATCHDOG_S: Final = 0.05  #: time without commands before the watchdog bit is set: Developer Guide, 7.1.2
 
 _ALWAYS: Final = (
     State.ALTITUDE_CONTROL
@@ -106,8 +106,8 @@ class ArdroneLogic:
         self._linked = False  # whether a command has arrived since the start or the last link loss
         self._watchdog = True
         self._ack = False
-        self.lost = False  #: whether the link counts as lost after a long silence
-        self._ids: Ids | None = None  # ids from the immediately preceding command
+        self.lost = False  #: whether the link counts as lost after a long time without commands
+        self._ids: Ids | None = None  # ids received with the previous command
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
         self.bootstrap = True  #: whether the drone sends no options yet, until its mode is configured
@@ -134,7 +134,7 @@ class ArdroneLogic:
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Execute the commands in a datagram. Never raises, whatever the content."""
+        """Execute the commands in a datagram. Never raises, regardless of content."""
         commands, malformed = parse_commands(datagram)
         self.malformed += malformed
         for command in commands:
@@ -171,7 +171,7 @@ class ArdroneLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits; ``video`` says whether any client is receiving video."""
+        """Return the state bits. ``video``: whether any client is receiving video."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,

@@ -44,7 +44,7 @@ class Snapshot:
     believed: VehicleFeedback
     state: FlightState
     time: int  #: see :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time`
-    thrust: float = 0.0  #: as a multiple of the weight
+    thrust: float = 0.0  #: multiple of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that are reported as level
     progress: Progress = NO_PROGRESS
@@ -94,7 +94,7 @@ def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
     """Return the tags of the options to send, in ascending order, for the mask ``general:navdata_options``.
 
     In demo mode these are the tags in the default mask and in the configured one. In full mode they are those in the
-    configured mask or, if it is still the default, all: real drones do so for programs that never configure it.
+    configured mask or, if it is still the default, all of them: real drones send all to programs that never set it.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL
@@ -132,7 +132,7 @@ def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
 
 
 def _raw(s: Snapshot) -> o.Option:
-    """Return the raw measurements. The converters' scales are estimates; programs read the battery voltage here."""
+    """Return the raw measurements. The converters' scales are estimates, but programs read the battery voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
         gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),
@@ -226,7 +226,7 @@ def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
     return lambda _: option
 
 
-#: By tag; options without any values to report are zero, and 27 is ``Gps``.
+#: Functions that make the options, by tag. Options without any values to report are all zero, and 27 is ``Gps``.
 _MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
     **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
     **{0: _demo, 1: lambda s: o.Time(s.time), 2: _raw, 3: _physical, 5: _euler_angles},

@@ -103,7 +103,7 @@ class PavePacker:
         self._position = 0
 
     def pack(self, picture: NDArray[np.uint8], settings: VideoSettings, captured_ns: int) -> Piece | None:
-        """Encode an image and add its header; None if the encoder returned nothing."""
+        """Encode an image and add its header; return None if the encoder produced no output."""
         form = FORMATS[settings.codec]
         wanted = form, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -172,19 +172,19 @@ def encode(
         packet = _pack(_quantised(coefficients, q), _CODES[width, height], q, number)
         if len(packet) <= max_bytes:
             return packet
-    raise UsageError(f"a picture of {width}x{height} takes {len(packet)} bytes even at the coarsest, not {max_bytes}")
+    raise UsageError(f"a {width}x{height} image takes {len(packet)} bytes even at the coarsest, more than {max_bytes}")
 
 
 def _check(picture: NDArray[np.uint8], number: int, quant: int) -> None:
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        raise UsageError(f"a picture is uint8 (height, width, 3), not {picture.dtype} {picture.shape}")
+        raise UsageError(f"an image must be uint8 (height, width, 3), got {picture.dtype} {picture.shape}")
     if picture.shape[1::-1] not in _CODES:
         sizes = ", ".join(f"{w}x{h}" for w, h in sorted(_CODES))
-        raise UsageError(f"UVLC has no pictures of {picture.shape[1]}x{picture.shape[0]}; it has {sizes}")
+        raise UsageError(f"UVLC does not support {picture.shape[1]}x{picture.shape[0]} images, only {sizes}")
     if not 0 <= number < 1 << uvlc.NUMBER_BITS:
-        raise UsageError(f"a picture's number has {uvlc.NUMBER_BITS} bits; {number} doesn't fit")
+        raise UsageError(f"picture number {number} does not fit in {uvlc.NUMBER_BITS} bits")
     if not uvlc.FINEST_QUANT <= quant <= uvlc.TABLE_QUANT:
-        raise UsageError(f"a quantiser is {uvlc.FINEST_QUANT} to {uvlc.TABLE_QUANT}, not {quant}")
+        raise UsageError(f"quantiser must be from {uvlc.FINEST_QUANT} to {uvlc.TABLE_QUANT}, got {quant}")
 
 
 def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -240,7 +240,7 @@ def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> 
 
 
 def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
-    """Return the zeros that fill up to the next multiple of ``size`` bits."""
+    """Return the zeros that pad to the next multiple of ``size`` bits."""
     return np.zeros(-sum(map(len, bits)) % size, np.uint8)
 
 
@@ -258,7 +258,7 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
     is_pair = np.ones(ends[-1], bool)
     is_pair[means] = is_pair[descriptions] = False
     all_values, all_widths = np.empty((2, ends[-1]), np.int64)
-    all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # after the 0 bit for "coded"
+    all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # the 0 bit for "coded", then 8 bits
     all_values[means], all_widths[means] = blocks[:, 0], uvlc.DC_BITS
     all_values[is_pair], all_widths[is_pair] = values, widths
     return all_values, all_widths

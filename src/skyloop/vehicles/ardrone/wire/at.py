@@ -17,8 +17,8 @@ from typing import Final, TypeAlias
 from skyloop.errors import UsageError
 
 PORT: Final = 5556
-MAX_LINE: Final = 1024  #: characters; the drone drops longer lines
-SILENCE_RESET_S: Final = 2.0  #: after this silence the drone expects the sequence to restart at 1
+MAX_LINE: Final = 1024  #: maximum length of a line [characters]; the drone drops longer ones
+SILENCE_RESET_S: Final = 2.0  #: time without commands after which the drone expects the sequence to restart at 1
 
 Argument: TypeAlias = int | float | str
 #: A command's name, and the arguments that follow its sequence number.
@@ -37,7 +37,7 @@ class Pcmd(IntFlag):
     """Flags in ``PCMD`` and ``PCMD_MAG``."""
 
     HOVER = 0  #: the four values are ignored
-    PROGRESSIVE = 1  #: the four values are followed
+    PROGRESSIVE = 1  #: the drone follows the four values
     COMBINED_YAW = 2
     ABSOLUTE = 4  #: the values are relative to a heading (``PCMD_MAG`` only)
 

@@ -78,7 +78,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 
 
 class Category(Enum):
-    """What a key's value belongs to on a drone with sessions, users and applications (AR.Drone 2)."""
+    """The scope of a key's value on a drone with sessions, users and applications (AR.Drone 2)."""
 
     COMMON = "common"
     APPLICATION = "application"

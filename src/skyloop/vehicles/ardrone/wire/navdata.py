@@ -88,7 +88,7 @@ class ControlState(IntEnum):
 
 Floats: TypeAlias = tuple[float, ...]
 Ints: TypeAlias = tuple[int, ...]
-Option: TypeAlias = Any  #: a named tuple, one of those below
+Option: TypeAlias = Any  #: one of the named tuples below
 
 
 class Layout:
@@ -135,7 +135,7 @@ _Kind = TypeVar("_Kind", bound=type[Any])
 
 
 def _option(tag: int, form: str) -> Callable[[_Kind], _Kind]:
-    """Register an option whose fields the driver reads: a class, so that their types are checked."""
+    """Register a class for an option whose fields the driver reads. Using a class lets their types be checked."""
 
     def register(kind: _Kind) -> _Kind:
         layout = Layout(tag, kind, form.split())
@@ -288,7 +288,7 @@ class VisionDetect(NamedTuple):
 
 #: The control loop's watchdog.
 Watchdog = _declared(17, "Watchdog", "i watchdog")
-#: A frame of the acquisition board.
+#: A frame from the acquisition board.
 AdcDataFrame = _declared(18, "AdcDataFrame", "I version; 32B data")
 #: The state of the video encoder.
 VideoStream = _declared(
@@ -360,10 +360,10 @@ def decode(datagram: bytes | memoryview) -> Navdata:
         raise DecodeError(f"{len(datagram)} bytes are not navdata")
     signature, state, sequence, vision_defined = _HEADER.unpack_from(datagram)
     if signature != SIGNATURE:
-        raise DecodeError(f"navdata begins with {SIGNATURE:#x}, not with {signature:#x}")
+        raise DecodeError(f"navdata must begin with {SIGNATURE:#x}, got {signature:#x}")
     tag, size, checksum = _CHECKSUM.unpack_from(datagram, end)
     if tag != _CHECKSUM_TAG or size != _CHECKSUM.size:
-        raise DecodeError("navdata that does not end with a checksum")
+        raise DecodeError("navdata does not end with a checksum")
     if checksum != sum(datagram[:end]):
         raise DecodeError(f"navdata {sequence} is damaged: its checksum is wrong")
     options, unknown = _decode_options(datagram, end)
@@ -386,7 +386,7 @@ def _decode_options(datagram: bytes | memoryview, end: int) -> tuple[dict[type[O
     at = _HEADER.size
     while at < end:
         if at + _OPTION.size > end:
-            raise DecodeError("navdata with bytes that belong to no option")
+            raise DecodeError("navdata has bytes that belong to no option")
         tag, size = _OPTION.unpack_from(datagram, at)
         if size < _OPTION.size or at + size > end:
             raise DecodeError(f"navdata option {tag} of {size} bytes does not fit in its datagram")
@@ -413,7 +413,7 @@ class Ports:
 
     @classmethod
     def free(cls) -> Ports:
-        """Return ports that are all 0, for any free ones."""
+        """Return ports that are all 0, which stands for any free ones."""
         return cls(0, 0, 0, 0)
 
 

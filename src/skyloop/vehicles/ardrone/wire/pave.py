@@ -18,7 +18,7 @@ SIGNATURE: Final = b"PaVE"
 MIN_HEADER: Final = 64
 MAX_HEADER: Final = 128
 MAX_SIDE: Final = 4096
-DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: bytes; the drone's 720p key frames are smaller than 100 kB
+DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: size in bytes; the drone's 720p key frames are smaller than 100 kB
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and including advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1
@@ -54,7 +54,7 @@ class PaveFrame:
     type: int  #: one of :class:`FrameType`, or another number
     number: int  #: the drone's frame count
     timestamp_ms: int  #: time on the drone's own clock
-    width: int  #: width of the image to show [px]
+    width: int  #: width of the displayed image [px]
     height: int
     stream_id: int
     payload: bytes
@@ -70,7 +70,7 @@ class PaveFrame:
 class _Header:
     size: int
     payload_size: int
-    frame: PaveFrame  #: still without its payload
+    frame: PaveFrame  #: frame whose payload is still empty
 
 
 def build_header(
@@ -97,7 +97,7 @@ def build_header(
     unless ``header_size`` is 64 or 68.
     """
     if header_size not in (MIN_HEADER, _HEADER.size + _RESERVED.size):
-        raise UsageError(f"a header has 64 bytes, as early firmware writes it, or 68, not {header_size}")
+        raise UsageError(f"header_size must be 64, as in early firmware, or 68, got {header_size}")
     encoded_width, encoded_height = (-(-side // _MACROBLOCK) * _MACROBLOCK for side in (width, height))
     sides = encoded_width, encoded_height, width, height
     low, high = position & 0xFFFFFFFF, position >> 32 & 0xFFFFFFFF
@@ -132,7 +132,7 @@ class PaveParser:
         return len(self._buffer)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[PaveFrame]:
-        """Add bytes from the stream; return the frames that they complete. Never raises, whatever the input."""
+        """Add bytes from the stream; return the frames that they complete. Never raises, regardless of input."""
         self._buffer += data
         frames: list[PaveFrame] = []
         while (header := self._header or self._find_header()) is not None:
@@ -178,7 +178,7 @@ class PaveParser:
         while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
             self._searched = inner
             if inner + MIN_HEADER > len(self._buffer):
-                return False  # not enough bytes to tell yet
+                return False  # there are not enough bytes to tell yet
             if _read_header(self._buffer, inner, self.max_payload) is not None:
                 self.broken_frames += 1
                 self._skip(inner)
@@ -188,7 +188,7 @@ class PaveParser:
         return False
 
     def _is_followed_well(self, header: _Header) -> bool:
-        """Return whether another frame begins right after this one; if not, some of this one's bytes are wrong."""
+        """Return whether another frame begins right after this one; if not, some bytes of this one are wrong."""
         end = header.size + header.payload_size
         return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 

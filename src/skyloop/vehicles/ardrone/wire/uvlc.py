@@ -1,4 +1,4 @@
-"""UVLC, the Parrot AR.Drone 1's video codec: a datagram in, a picture out. Pure; NumPy only.
+"""UVLC, the video codec of the Parrot AR.Drone 1: turns one datagram into one image. Pure; NumPy only.
 
 The drone sends one picture per datagram from its UDP port 5555, without an additional header. A picture consists of
 16-line groups of 16x16 macroblocks (4:2:0), made of 8x8 cosine-transformed blocks. Each block is a 10-bit mean, then
@@ -10,7 +10,7 @@ run and level codes (see below). No recording of this video is public; the sourc
   pictures with them: the order of the coefficients, and the steps for quantiser 31; the latter also prints the first 12
   bytes of a picture.
 
-Where they disagree, this module follows whatever worked with real drones:
+Where they disagree, this module does what is known to work with real drones:
 
 * If a macroblock's first bit is set, it is *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
 * Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if the quantiser is 31 ("the old
@@ -23,8 +23,8 @@ Where they disagree, this module follows whatever worked with real drones:
   group; at 31 it is read and ignored, as in python-ardrone.
 * Macroblocks that would be partly outside the picture are not coded (Parrot SDK): for 88x72, 80x64 is coded, and for
   160x120, 160x112.
-* P pictures have never been seen. As in the Parrot SDK, their coded macroblocks are complete in themselves. The others
-  repeat the previous picture, whose number must be one less, as in H.263, which the guide names as the codec's origin.
+* P pictures have never been seen. Their coded macroblocks are complete in themselves (Parrot SDK). As in H.263, from
+  which the guide derives the codec, the others repeat the previous picture, whose number must be one lower.
 
 There is no checksum, so a damaged packet can pass for a picture. The decoder checks everything that the format allows.
 
@@ -65,7 +65,7 @@ from skyloop.errors import DecodeError
 START_CODE_BITS: Final = 22
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this plus k
 P264_START: Final = 0x40  #: start code of the drone's other codec
-END_OF_PICTURE: Final = 0x3F  #: marks the end where group 31 would start
+END_OF_PICTURE: Final = 0x3F  #: code that marks the end where group 31 would start
 MAX_GROUPS: Final = 31
 
 FORMAT_BITS: Final = 2
@@ -75,7 +75,7 @@ QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
-BLOCKS: Final = 6  #: blocks in a macroblock: four for luma in reading order, then Cb and Cr at half resolution
+BLOCKS: Final = 6  #: blocks per macroblock: four for luma in reading order, then Cb and Cr at half resolution
 SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
 DC_BITS: Final = 10
@@ -92,7 +92,7 @@ MAX_RUN_ZEROS: Final = 6  #: number of leading zeros in the longest code for a r
 class PictureType(IntEnum):
     """Values of the header's picture type."""
 
-    INTRA = 0  #: complete in itself
+    INTRA = 0  #: can be decoded without any other picture
     INTER = 1  #: uncoded macroblocks repeat the previous picture
 
 
@@ -141,10 +141,10 @@ INVERSE_TRANSFORM: Final = _inverse_transform()
 
 # Run and level codes -------------------------------------------------------------------------------------------------
 
-WINDOW: Final = 16  #: bits per table lookup
-PADDING: Final = 32  #: zero bytes appended to the packet, so that no lookup goes past the end
-_PAIRS: Final = 5  #: maximum number of whole pairs in a window, as the shortest takes 3 bits
-_MAX_LEVEL_ZEROS: Final = 11  #: allows levels below 2048; pictures of 8-bit samples have none greater
+WINDOW: Final = 16  #: number of bits per table lookup
+PADDING: Final = 32  #: number of zero bytes appended to the packet, so that no lookup goes past the end
+_PAIRS: Final = 5  #: maximum number of whole pairs in a window; the shortest pair takes 3 bits
+_MAX_LEVEL_ZEROS: Final = 11  #: limit that allows levels below 2048; pictures of 8-bit samples have none greater
 
 Ints = NDArray[np.int64]
 
@@ -161,7 +161,7 @@ class PairTable:
 
 @cache
 def pair_table() -> PairTable:
-    """Return the table, which is built at first use (taking tens of milliseconds)."""
+    """Return the table, which is built on first use (taking tens of milliseconds)."""
     rest = np.arange(1 << WINDOW)
     used = np.zeros_like(rest)
     count = np.zeros_like(rest)
@@ -219,8 +219,8 @@ class BlockWalker:
         self.window = windows.data  #: the windows as a memory view, which is faster for single lookups
         self._steps = self._table.step[windows].data
         self._visits: list[int] = []  # positions of the windows with whole pairs, and of the long pairs [bits]
-        self._ends: list[int] = []  # number of visits at the end of each block
-        self._long: list[tuple[int, int, int]] = []  # for each pair longer than a window: visit, run + 1 and level
+        self._ends: list[int] = []  # number of entries in ``_visits`` at the end of each block
+        self._long: list[tuple[int, int, int]] = []  # visit, run + 1 and level of each pair longer than a window
 
     def walk(self, at: int) -> int:
         """Read the next block's pairs from bit ``at`` to the end of the block; return the position of the bit after it.
@@ -243,10 +243,10 @@ class BlockWalker:
         """Read one pair that is invalid or does not fit in a window; return the position of the bit after it."""
         zeros, run, at = self._read_value(at)
         if zeros > MAX_RUN_ZEROS:
-            raise DecodeError(f"{zeros} zeros do not begin a code of a run")
+            raise DecodeError(f"{zeros} zeros cannot begin a run's code")
         zeros, level, at = self._read_value(at)
         if zeros == 1 or zeros > _MAX_LEVEL_ZEROS:
-            raise DecodeError(f"{zeros} zeros do not begin a code of a level after a run of {run}")
+            raise DecodeError(f"{zeros} zeros cannot begin a level's code after a run of {run}")
         level = max(level, 1)
         negative = self.window[at] >> (WINDOW - 1)
         self._long.append((len(self._visits) - 1, run + 1, -level if negative else level))
@@ -276,12 +276,12 @@ class BlockWalker:
         advance[pairs_before[long_visit]] = long_advance
         level[pairs_before[long_visit]] = long_level
 
-        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # in pairs, for each block
+        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # counted in pairs, for each block
         travelled = np.concatenate([[0], np.cumsum(advance)])
         pairs = np.diff(ends)
         place = travelled[1:] - np.repeat(travelled[ends[:-1]], pairs)
         if place.size and place.max() >= COEFFICIENTS:
-            raise DecodeError(f"a block has a coefficient {place.max()}; {COEFFICIENTS - 1} is the last")
+            raise DecodeError(f"a block has a coefficient {place.max()}, but the last is {COEFFICIENTS - 1}")
         levels = np.zeros((pairs.size, COEFFICIENTS), np.float32)
         levels[np.repeat(np.arange(pairs.size), pairs), place] = level
         return levels
@@ -289,8 +289,8 @@ class BlockWalker:
 
 # Pictures ------------------------------------------------------------------------------------------------------------
 
-MAX_PACKET: Final = 65_535  #: bytes, because a picture is one datagram
-_MAX_TAIL_BITS: Final = 64  # zeros that pad the last word after the end of the picture
+MAX_PACKET: Final = 65_535  #: maximum size of a picture, which is one datagram [bytes]
+_MAX_TAIL_BITS: Final = 64  # number of zero bits after the end of the picture that are too many for padding
 # Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
 # also be rounded up by half a step.
 _MAX_DC: Final = 2048
@@ -312,7 +312,7 @@ class UvlcHeader:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UvlcPicture(UvlcHeader):
-    """One picture from the drone's camera."""
+    """One image from the drone's camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
 
@@ -323,7 +323,7 @@ def is_p264(packet: bytes | bytearray | memoryview) -> bool:
 
 
 def is_intra(packet: bytes | bytearray | memoryview) -> bool:
-    """Return whether a datagram begins like a picture that is complete in itself."""
+    """Return whether a datagram starts with the header of an intra picture, which needs no other picture."""
     head = int.from_bytes(bytes(packet[:4]), "little")
     kind = head >> (32 - START_CODE_BITS - FORMAT_BITS - RESOLUTION_BITS - TYPE_BITS) & (1 << TYPE_BITS) - 1
     return head >> (32 - START_CODE_BITS) == UVLC_START and kind == PictureType.INTRA
@@ -355,13 +355,13 @@ class UvlcDecoder:
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
-            raise DecodeError(f"picture {header.number} changes a picture that never arrived")
+            raise DecodeError(f"picture {header.number} updates a picture that never arrived")
         last, samples = self._last
         if header.number != last.number + 1 & 0xFFFFFFFF:
-            raise DecodeError(f"picture {header.number} changes the one before it, but {last.number} was the last")
+            raise DecodeError(f"picture {header.number} updates the one before it, but {last.number} was the last")
         if (header.width, header.height) != (last.width, last.height):
             raise DecodeError(
-                f"picture {header.number} of {header.width}x{header.height} changes one of {last.width}x{last.height}"
+                f"picture {header.number} of {header.width}x{header.height} updates one of {last.width}x{last.height}"
             )
         return samples
 
@@ -371,9 +371,9 @@ class _Reader:
 
     def __init__(self, packet: bytes) -> None:
         if len(packet) > MAX_PACKET:
-            raise DecodeError(f"{len(packet)} bytes are too many for a picture; at most {MAX_PACKET} are one datagram")
+            raise DecodeError(f"{len(packet)} bytes are too many for a picture; a datagram has at most {MAX_PACKET}")
         if len(packet) % 4 or not packet:
-            raise DecodeError(f"{len(packet)} bytes are not whole words of 4: the packet is torn")
+            raise DecodeError(f"{len(packet)} bytes are not a whole number of 4-byte words: the packet is torn")
         self._walker = BlockWalker(bit_windows(packet))
         self._window = self._walker.window
         self._end = 8 * len(packet)
@@ -385,15 +385,15 @@ class _Reader:
     def read_header(self) -> UvlcHeader:
         code = self._read(START_CODE_BITS)
         if code == P264_START:
-            raise DecodeError("a picture of P264, which is not supported: set video:video_codec to UVLC (0x20)")
+            raise DecodeError("P264 pictures are not supported: set video:video_codec to UVLC (0x20)")
         if code != UVLC_START:
-            raise DecodeError(f"a picture of UVLC begins with {UVLC_START:#08x}, this with {code:#08x}")
+            raise DecodeError(f"a UVLC picture must begin with {UVLC_START:#08x}, got {code:#08x}")
         form, resolution = self._read(FORMAT_BITS), self._read(RESOLUTION_BITS)
         if (form, resolution) not in SIZES:
-            raise DecodeError(f"there is no picture of format {form} and resolution {resolution}")
+            raise DecodeError(f"no picture has format {form} and resolution {resolution}")
         kind = self._read(TYPE_BITS)
         if kind not in (PictureType.INTRA, PictureType.INTER):
-            raise DecodeError(f"there is no picture of type {kind}")
+            raise DecodeError(f"unknown picture type {kind}")
         quant = self._read_quant()
         width, height = (side - side % MACROBLOCK for side in SIZES[form, resolution])
         return UvlcHeader(self._read(NUMBER_BITS), PictureType(kind), quant, width, height)
@@ -437,7 +437,7 @@ class _Reader:
 
     def _read_quant(self) -> int:
         if not (quant := self._read(QUANT_BITS)):
-            raise DecodeError(f"a quantiser is {FINEST_QUANT} to {TABLE_QUANT}, not 0")
+            raise DecodeError(f"the quantiser must be from {FINEST_QUANT} to {TABLE_QUANT}, got 0")
         return quant
 
     def _read_macroblocks(self, group: int, count: int, quant: int) -> None:
@@ -488,7 +488,7 @@ class _Reader:
         limits = np.full(COEFFICIENTS, _MAX_AC, np.float32)
         limits[0] = _MAX_DC
         if (np.abs(coefficients) > limits + steps / 2).any():
-            raise DecodeError("a coefficient is greater than in any picture")
+            raise DecodeError("a coefficient exceeds the range of a valid picture")
         values = coefficients @ INVERSE_TRANSFORM
         np.clip(np.rint(values, out=values), 0, 255, out=values)
         samples[coded] = values.astype(np.uint8).reshape(-1, BLOCKS, COEFFICIENTS)
@@ -500,7 +500,7 @@ def _changed_quant(quant: int, code: int) -> int:
         return quant
     changed = quant + DQUANT[code]
     if not FINEST_QUANT <= changed <= COARSEST_QUANT:
-        raise DecodeError(f"its quantiser would be {changed}, not {FINEST_QUANT} to {COARSEST_QUANT}")
+        raise DecodeError(f"its quantiser would be {changed}, outside {FINEST_QUANT} to {COARSEST_QUANT}")
     return changed
 
 

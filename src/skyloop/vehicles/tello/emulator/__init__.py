@@ -62,12 +62,12 @@ TELLO: Final = VehicleParameters(
     half_height_m=0.02,
     rotor_radius_m=0.038,
     rotor_height_m=0.03,
-    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s from leaving the ground to hovering, in a recorded flight
+    takeoff_climb_m_s=0.7,  # from a recorded flight: 0.8 m in the 1.3 s between leaving the ground and hovering
     battery_full_v=4.35,
     battery_empty_v=3.3,
     battery_charge_c=3960.0,  # 1100 mAh
     battery_resistance_ohm=0.03,
-    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, minus the electronics
+    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, minus what the electronics use
     electronics_power_w=2.0,
 )
 LIMITS: Final = Limits(
@@ -75,7 +75,7 @@ LIMITS: Final = Limits(
     climb_m_s=FULL_CLIMB_M_S,
     yaw_rate_rad_s=FULL_YAW_RATE_RAD_S,
     altitude_m=10.0,
-    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # with the stick in a corner
+    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # the speed with a stick in a corner
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
@@ -92,7 +92,7 @@ FRONT: Final = replace(
     distortion=(-0.033458, 0.105152, 0.001256, -0.006647, 0.0),
     position_m=(0.05, 0.0, 0.0),
 )
-BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: the lens is an estimate
+BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: the lens parameters are an estimate
 
 
 def with_tellos(options: SimOptions | None = None) -> SimOptions:
@@ -114,7 +114,7 @@ class Settings:
 
 STATE_HZ: Final = 10.0
 GROUP: Final = 30  #: number of images from one key frame to the next
-FULL_KBPS: Final = 2500  #: results in images of 10 kB
+FULL_KBPS: Final = 2500  #: bitrate that makes images of about 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
 
@@ -132,7 +132,7 @@ class TelloPacker:
         self.size = (FRONT.width, FRONT.height)
 
     def pack(self, picture: NDArray[np.uint8], settings: OneCamera, _captured_ns: int) -> Piece | None:
-        """Encode an image; None if the encoder returned nothing."""
+        """Encode an image; return None if the encoder produced no output."""
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -144,7 +144,7 @@ class TelloPacker:
 
 
 class RunningFirmware(RunningEmulator):
-    """A Tello that is switched on. Its logic and ports belong to the loop's thread."""
+    """A Tello that is switched on. Use its logic and ports only on the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-tello")
@@ -237,7 +237,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
+        """Return the frame rate at which to render this camera: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self.logic.streaming and self.logic.client is not None else 0.0
 
 
@@ -274,17 +274,17 @@ class TelloFirmware(Emulator[RunningFirmware]):
         pads: Mapping[int, tuple[float, float]] | None = None,
     ) -> None:
         if sdk not in list(Sdk):
-            raise UsageError(f"there is SDK {', '.join(Sdk)} of the Tello, not {sdk!r}")
+            raise UsageError(f"sdk must be one of {', '.join(Sdk)}, got {sdk!r}")
         for number in pads or {}:
             if not 1 <= number <= MOST:
-                raise UsageError(f"mission pads are numbered from 1 to {MOST}, not {number!r}")
+                raise UsageError(f"mission pads are numbered from 1 to {MOST}, got {number!r}")
         require_encoder("the video of an emulated Tello")
         super().__init__(host, drone)
         self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, port=running.port)  # keeps the port for a restart
+        self.settings = replace(self.settings, port=running.port)  # keeps the port the same after a restart
         return running
 
     @property
@@ -294,5 +294,5 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     @property
     def logic(self) -> TelloLogic:
-        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Use it only on the loop's thread."""
         return self._started.logic

@@ -38,17 +38,17 @@ from skyloop.vehicles.tello.wire import (
 
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
-RISES_WITHIN_S: Final = 0.5  #: if it has not risen within this simulated time, take-off was refused for a low battery
-TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although it hovered long before
+RISES_WITHIN_S: Final = 0.5  #: simulated time without rising after which take-off was refused for a low battery
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although the drone hovered long before
 FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
-PATIENCE_S: Final = 30.0  #: a command that takes longer than this fails
-_NEAR_M: Final = 0.06  # a move ends within this distance …
-_SLOW_M_S: Final = 0.12  # … and below this speed
-_NEAR_RAD: Final = 0.03  # a turn ends within this angle
+PATIENCE_S: Final = 30.0  #: time after which an unfinished command fails
+_NEAR_M: Final = 0.06  # maximum distance at which a move ends …
+_SLOW_M_S: Final = 0.12  # … and the maximum speed
+_NEAR_RAD: Final = 0.03  # maximum angle at which a turn ends
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
-#: The vehicle's next command, and the reply if the command that takes time is over.
+#: The vehicle's next command, and the reply if the running command has ended.
 Step = tuple[AnyAction | None, str | None]
 
 
@@ -93,7 +93,7 @@ class Flipping:
 
 
 class Turning:
-    """``cw`` and ``ccw``: an angle, positive counter-clockwise, maybe several turns."""
+    """``cw`` and ``ccw``: turns by an angle, positive counter-clockwise, which may exceed a full turn."""
 
     def __init__(self, report: Report, by_rad: float) -> None:
         self._left_rad = by_rad
@@ -108,7 +108,7 @@ class Turning:
 
 
 class Going:
-    """Moves, ``go`` and ``curve``, by waypoints in world axes [m]."""
+    """Motions through waypoints in world axes [m]: moves, ``go`` and ``curve``."""
 
     def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
         self._places = list(places)
@@ -143,7 +143,7 @@ Range = tuple[int, int]
 _MOVE: Final[tuple[Range, ...]] = ((20, 500),)
 _SPEED: Final[Range] = (10, 100)
 _PLACE: Final[tuple[Range, ...]] = ((-500, 500),) * 3
-_LEAST_CM: Final = 20  # at least one coordinate of a position must have this magnitude
+_LEAST_CM: Final = 20  # magnitude that at least one coordinate of a target must have
 
 MOVES: Final = {
     "up": (0, 0, 1),
@@ -221,7 +221,7 @@ class TelloLogic:
         self._job: tuple[Job, Address | None] | None = None  # the running job, with the recipient of its reply
         self._received_ns = clock()
         self._speed_cm_s = USUAL_SPEED_CM_S
-        self._start: tuple[float, float] | None = None  # yaw at switch-on, altitude at take-off
+        self._start: tuple[float, float] | None = None  # yaw when switched on, altitude at take-off
         self._motor_s = 0.0
         self._before_s: float | None = None
         self.client: str | None = None  #: the recipient of state and video; None before ``command``
@@ -232,13 +232,13 @@ class TelloLogic:
         self.looks_for_pads = False
         self.fps = FPS["high"]
         self.size = SIZES["high"]
-        self.bitrate_mbps = 0  #: 0 to adapt to the link
+        self.bitrate_mbps = 0  #: bitrate; 0 to adapt to the link
         self.unknown = 0  #: number of datagrams that were not commands
 
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes, sender: Address) -> None:
-        """Execute a command and reply to it. Never raises, whatever the content."""
+        """Execute a command and reply to it. Never raises, regardless of content."""
         text = decoded(datagram)
         if not text or (self.client is None and text != ENTER):
             self.unknown += 1
@@ -251,7 +251,7 @@ class TelloLogic:
             self._answer(reply, sender)
 
     def supervise(self, report: Report) -> None:
-        """Handle the vehicle's newest report and continue the present command. Called regularly."""
+        """Handle the vehicle's newest report and continue the current command. Called regularly."""
         truth = report.truth
         if self._start is None:
             self._start = report.believed.yaw_rad, report.believed.altitude_m
@@ -261,7 +261,7 @@ class TelloLogic:
         self._report = report
         if truth.state is FlightState.EMERGENCY:
             self._job = None
-            self._vehicle.command(ResetEmergency())  # takes effect on the ground: a Tello has no emergency state
+            self._vehicle.command(ResetEmergency())  # this takes effect on the ground: a Tello has no emergency state
         if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:
@@ -278,7 +278,7 @@ class TelloLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state_string(self) -> bytes | None:
-        """Return the present state string; None before the first report."""
+        """Return the current state string; None before the first report."""
         snapshot = self._snapshot()
         return None if snapshot is None else telemetry.state_string(snapshot, self._sdk)
 
@@ -296,7 +296,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the reply, or None if there is none or it comes later."""
+        """Execute a command. Return the reply, or None if there is none yet or none will come."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"
@@ -341,7 +341,7 @@ class TelloLogic:
             self.bitrate_mbps = numbers[0]
         elif name == "downvision":
             self.looks_down = bool(numbers[0])
-        return OK  # mdirection: pads are seen whatever it is
+        return OK  # ``mdirection`` has no effect: pads are seen in any case
 
     def _configure(self, name: str, words: list[str], text: str) -> str:
         if name in ("streamon", "streamoff"):

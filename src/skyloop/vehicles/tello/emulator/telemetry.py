@@ -14,7 +14,7 @@ from skyloop.sim.reports import VehicleTruth
 from skyloop.vehicles.tello.wire import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
 
 MOST: Final = 8
-LOWEST_M: Final = 0.3  #: pads are recognised between this height and the next; estimates
+LOWEST_M: Final = 0.3  #: minimum height at which pads are recognised; an estimate, like the maximum
 HIGHEST_M: Final = 1.2
 _VIEW: Final = 0.5  # horizontal reach of the downward camera as a fraction of the height; an estimate
 
@@ -50,7 +50,7 @@ class Snapshot:
     """The state at one instant."""
 
     report: Report
-    start_yaw_rad: float  #: yaw at switch-on
+    start_yaw_rad: float  #: yaw when the drone was switched on
     start_altitude_m: float  #: altitude at take-off
     motor_s: int
     pad: Sighting | None = None
@@ -61,7 +61,7 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
     believed = snapshot.report.believed
     yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
     forward, left, up = believed.velocity_m_s
-    ahead, aside = turned(forward, left, yaw_rad)  # relative to the heading at switch-on
+    ahead, aside = turned(forward, left, yaw_rad)  # velocity relative to the heading at power-on
     ax, ay, az = (part / GRAVITY_M_S2 * 1000 for part in believed.acceleration_m_s2)
     altitude_cm = believed.altitude_m * 100
     steep = math.cos(believed.roll_rad) * math.cos(believed.pitch_rad)
