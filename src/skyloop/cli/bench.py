@@ -73,7 +73,7 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
 
 
 def delay_table(results: DelayResults) -> Table:
-    """Return a table of the delays, next to those of the bare hand-over."""
+    """Return a table of the delays, with those of a bare hand-over for comparison."""
     rows = [
         (
             f"{row.channel} {row.size}" if row.channel == "video" else row.channel,

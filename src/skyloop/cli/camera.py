@@ -104,7 +104,7 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length, principal point and distortion, and write them to a JSON file.
 
-    Show the board near and far, in all corners of the picture, and tilted. Views that differ enough are taken
+    Show the board near and far, in all corners of the image, and tilted. Views that differ enough are taken
     automatically; press Ctrl-C to stop early.
     """
     from skyloop.vision.calibrating import BoardFinder
@@ -146,17 +146,17 @@ def list_cameras() -> None:
 
 
 class _Search:
-    """Searches pictures for the board, one after another."""
+    """Searches images for the board, one after another."""
 
     def __init__(self, finder: BoardFinder, most: int) -> None:
-        self.every = False  #: take every view, which is right for single pictures; in a stream, only differing ones are
+        self.every = False  #: whether to use every view, as for single images, or only different ones, as for a stream
         self.collector: Collector | None = None
         self.looked = 0
         self._finder = finder
         self._most = most
 
     def run(self, pictures: Iterable[Picture], found: Callable[[Any, BoardView], None] | None = None) -> None:
-        """Search until the pictures end, enough views are found, or Ctrl-C. :class:`UsageError` if sizes differ."""
+        """Search until the images end, enough views are found, or Ctrl-C. Raise ``UsageError`` if the sizes differ."""
         from skyloop.vision.calibrating import Collector
 
         try:
@@ -299,7 +299,7 @@ class _Vehicle:
             tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
-        """Show the board that was found in the cockpit."""
+        """Draw the detected board on the video in the cockpit."""
         from skyloop.messages import Points
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)

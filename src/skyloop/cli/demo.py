@@ -169,7 +169,7 @@ def drone_and_page(
     """Connect to a vehicle, wait for its first image, and show the page.
 
     ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port;
-    None: the default one. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
+    None for the default. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess
@@ -287,7 +287,7 @@ class DemoReport:
     """The results of a demonstration, and their table."""
 
     first_picture_s: float | None = None  #: measured from the start of the demo
-    frames: int = 0  #: number since the marker was first seen
+    frames: int = 0  #: number of frames since the marker was first seen
     share_in_view: float | None = None
     estimated: Spread | None = None
     true: Spread | None = None
@@ -340,7 +340,7 @@ def _spread_text(spread: Spread | None) -> str:
 
 
 def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
-    """Return a channel's row; none if the channel is unused."""
+    """Return a channel's row, or no row if the channel is unused."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

@@ -42,7 +42,7 @@ class Ending(msgspec.Struct, frozen=True):
 
     name: str
     ok: bool
-    outcome: str  #: how the flight ended, or why it did not
+    outcome: str  #: how the flight ended, or why it did not end
 
 
 def land(
@@ -113,7 +113,7 @@ def stop(
 ) -> None:
     """Emergency stop: cut the motors at once. The drones FALL.
 
-    This works no matter who flies, and asks first, except with --yes. Exit code 1 if a drone has not confirmed it.
+    It works no matter who is flying and asks first, unless --yes is given. Exit code 1 if a drone did not confirm.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:
@@ -156,7 +156,7 @@ def _each(
 ) -> None:
     """End all flights in parallel. Print a line for each as soon as it has ended, or everything as JSON.
 
-    ``interrupted`` is called on Ctrl-C; it must cause each ``end`` to return or raise.
+    ``interrupted`` is called on Ctrl-C and must make each call of ``end`` return or raise.
     """
 
     def attempt(name: str) -> Ending:
@@ -202,7 +202,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether its pilot lands it, such as another ``skyloop land`` with the same priority; wait for that."""
+    """Return whether its pilot is landing it, such as another ``skyloop land``; if so, wait until it has landed."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 
@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover, and start no more returns."""
+    """Hover permanently, so that no further return is attempted."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 

@@ -69,11 +69,11 @@ def fly(
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
-    With the word follow for FILE it follows a person, a car or the target in a box: skyloop fly follow --help.
+    If FILE is the word follow, it follows a person, a car or the target in a box: see skyloop fly follow --help.
 
     A line on standard error shows the progress; in a pipe, a new one every 5 seconds.
 
-    Ctrl-C lands too, as does an error in the controller without --reload.
+    Ctrl-C also lands the drone, as does an error in the controller without --reload.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -131,10 +131,10 @@ def run(
     Args:
         flight: The flight to run.
         drone: The drone, connected as a pilot.
-        seconds: The duration; None: until the controller ends, or Ctrl-C.
-        reloader: Reloads the controller's file; None: never reload.
+        seconds: The duration; if None, run until the controller ends or Ctrl-C is pressed.
+        reloader: Reloads the controller's file; if None, it is never reloaded.
         takeoff: Whether to take off from the ground.
-        progress: Shows the progress; None: the default display for flights.
+        progress: Shows the progress; if None, the default display for flights does.
 
     Returns:
         Whether the flight ended as intended. Errors during take-off are raised; those in the controller are shown.
@@ -218,7 +218,7 @@ class Flight:
                 self._report("the saved file is not used: the previous one keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
-        """Hover until a file that can be flown is saved; return False if the time ends or the drone is gone first."""
+        """Hover until a usable file is saved; return False if the time ends or the drone is gone first."""
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False

@@ -218,7 +218,7 @@ def compare(
     part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Compare a changed controller's commands to the old one's: RMS of each set-point, and where they diverge."""
+    """Compare the commands of an old and a changed controller: RMS of each set-point, and where they diverge."""
     from skyloop.recording.review.compare import compare as commands_of
 
     if output is not None and output.suffix not in (".html", ".png"):

@@ -1,4 +1,4 @@
-"""How command lines name drones and the network, with the same words, help and completion in every command.
+"""Options that name drones and the network, with the same words, help and completion in every command.
 
 A drone is given as NAME; ``--drone NAME`` means the same everywhere. The network is given as ``--network WHERE``.
 """
@@ -169,7 +169,7 @@ def join_network(network: str | None, keys: Path | None) -> None:
 
 
 def with_place(arguments: Sequence[str]) -> list[str]:
-    """Insert ``multicast`` after a ``--network`` that has no place; return the words."""
+    """Return the arguments with ``multicast`` inserted after any ``--network`` without a place."""
     words: list[str] = []
     for index, word in enumerate(arguments):
         words.append(word)

@@ -91,7 +91,7 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return the settings of a network given as in ``--network``.
+    """Return the settings of a network given as the value of ``--network`` and the related options.
 
     Raise ``UsageError`` if an address or the folder is invalid, or no place is given.
     """
@@ -246,7 +246,7 @@ def init(
     directory: LabOption = None,
     days: Annotated[int, typer.Option(metavar="N", help="Validity of the authority, and so of the lab")] = 1825,
 ) -> None:
-    """Create a lab's certificate authority. Its folder can make any key: keep it on one machine, with a backup."""
+    """Create a lab's certificate authority. Its folder lets anyone issue keys: keep it on one machine, backed up."""
     from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)

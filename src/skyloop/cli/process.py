@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
 _MOST_WORKERS: Final = 64
-MOST: Final = 64  #: most detections published per frame, the most certain: a result is limited to 32 768 bytes
+MOST: Final = 64  #: only the most certain detections are published, because a result is limited to 32 768 bytes
 
 
 def process(

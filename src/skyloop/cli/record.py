@@ -77,7 +77,7 @@ def record(
         in_process=True,
     )
     interrupt_by_signals((signal.SIGTERM,))
-    with recorder, suppress(KeyboardInterrupt):  # the normal way to end
+    with recorder, suppress(KeyboardInterrupt):  # the normal way to stop
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
 

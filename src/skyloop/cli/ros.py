@@ -45,8 +45,8 @@ def ros(
 ) -> None:
     """Show drones to ROS 2: images, state and transforms as topics; fly by cmd_vel and services. Until Ctrl-C.
 
-    Each drone is a namespace, such as /alpha. Only this machine finds it, unless --subnet or the ROS 2 variables say
-    otherwise. Drones flown by this command land when it ends.
+    Each drone is a namespace, such as /alpha. It is visible only on this machine, unless --subnet or the ROS 2
+    variables say otherwise. Drones flown by this command land when it ends.
     """
     from skyloop.ros import Bridge, Settings
     from skyloop.vehicles.ros2.node import domain_of
@@ -69,4 +69,4 @@ def ros(
                 typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
             bridge.run()
     except KeyboardInterrupt:
-        pass  # the normal way to end
+        pass  # the normal way to stop

@@ -107,7 +107,7 @@ def _run(flight: FlyRoute) -> None:
             for key in pressed(0.0) if pressed is not None else ():
                 if key.lower() in acts:
                     acts[key.lower()]()
-            return pressed is None and flight.law.state == "paused"  # no keyboard could resume the route
+            return pressed is None and flight.law.state == "paused"  # without a keyboard, the route can't be resumed
 
         flight.run(until=look)
     if flight.law.state == "paused":

@@ -175,7 +175,7 @@ def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
         raise UsageError(
             "these --autopilot fly different vehicles by default: choose one, such as --option vehicle=iris"
         )
-    return min(each, key=lambda options: options.most_lag_s)  # the strictest about the computer's time decides
+    return min(each, key=lambda options: options.most_lag_s)  # the strictest limit on the computer's lag applies
 
 
 def _serve_proxies(
@@ -339,7 +339,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 def address_from(base: str, drone: int) -> str:
     """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
 
-    Raise ``UsageError`` if the first address is not IPv4, or there is no next address.
+    Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
     """
     if drone == 0:
         return base
@@ -350,7 +350,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone: the first one's start at ``base`` (0: any free ones), each next one's 10 higher.
+    """Return an AR.Drone's ports, starting at ``base`` and 10 higher for each further drone; any free ones if it is 0.
 
     Raise ``UsageError`` if a port is out of range.
     """

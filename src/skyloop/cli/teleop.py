@@ -135,7 +135,7 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # the take-off may not show yet
+            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # it may lag a take-off
                 return self._obey("grounded")
             drone.hover()
         elif order == "take":

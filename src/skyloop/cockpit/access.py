@@ -39,14 +39,14 @@ PAIRING_S: Final = 3600.0  #: lifetime of a pairing code
 MAX_SESSIONS: Final = 1000
 SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
 MAX_TOKEN: Final = 256
-CERTIFICATE: Final = "peer_certificate"  #: key of the client's certificate in the connection's state
+CERTIFICATE: Final = "peer_certificate"  #: key under which a connection's state holds the client's certificate
 
 FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubles with each further one
 LONGEST_S: Final = 16.0  #: must be less than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
 FORGET_S: Final = 600.0  #: an address starts over if it sends no wrong token for this long
 MAX_ADDRESSES: Final = 1024  #: addresses remembered at once; the one that has been quiet for longest is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens per minute, from all addresses together, before the delay below is added
-EACH_IN_ALL_S: Final = 0.1  #: delay added by each further one per minute, from any address
+EACH_IN_ALL_S: Final = 0.1  #: delay added by each wrong token beyond those, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
@@ -57,7 +57,7 @@ _LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of these tables
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
 
-MAX_NAME: Final = 40  #: maximum length of a name that a person asks for
+MAX_NAME: Final = 40  #: maximum length of a name chosen by a person
 _log = logging.getLogger(__name__)
 
 
@@ -164,7 +164,7 @@ class Pairing:
     """
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
-        self.on_used: Callable[[str], None] = lambda _: None  #: called with address and role after a code was used
+        self.on_used: Callable[[str], None] = lambda _: None  #: called with address and role once a code has been used
         self.on_expired: Callable[[], None] = lambda: None  #: called once a code has expired
         self.role = role
         self._clock = clock
@@ -184,7 +184,7 @@ class Pairing:
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return who sent a code and use the code up; None if it is not the current one."""
+        """Return the person who sent a code, and use the code up; None if it is not the current one."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
@@ -299,8 +299,8 @@ class CertificateGate:
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
     """Return the role and name in a certificate.
 
-    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None if no OU is a
-    role, or several are.
+    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None unless
+    exactly one OU is a role.
     """
     if not certificate:
         return None
@@ -389,7 +389,7 @@ class WrongTokens:
     def __init__(self, clock: Clock = monotonic_ns) -> None:
         self.count = 0  #: number of wrong tokens since the start
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # number, and time of the last one; quietest address first
+        self._of_address: dict[str, tuple[int, int]] = {}  # count and time of the last; quietest address first
         self._minute_ns = clock()
         self._in_minute = 0
 

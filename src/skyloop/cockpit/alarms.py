@@ -36,7 +36,7 @@ class Alarm(msgspec.Struct, frozen=True):
     """A problem that currently exists.
 
     Args:
-        id: Its subject, constant while the alarm lasts: lets a page remember that a person acknowledged it.
+        id: The alarm's subject. It stays the same while the alarm lasts, so a page can remember acknowledgements.
         severity: May rise while the alarm lasts, for example when a degraded link is lost.
         text: A description that includes the current value.
     """

@@ -55,7 +55,7 @@ def start_task(work: Coroutine[Any, Any, None], running: set[asyncio.Task[None]]
 
 
 class PeriodicBroadcast:
-    """Creates a message at a steady rate, once for all subscribers, while there are any. On the event loop."""
+    """Creates a message at a steady rate, once for all subscribers, while there are any. Used on the event loop."""
 
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
         """Initialise without starting; the first subscriber starts it.
@@ -132,7 +132,7 @@ class Newest(Generic[K, V]):
         self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the most recently updated comes last
 
     def put(self, key: K, value: V) -> None:
-        """Set a key's value. If there is no place for a new key, refuse and count it."""
+        """Set a key's value. If there is no room for a new key, refuse it and count the refusal."""
         now_ns = self._clock()
         if self._values.pop(key, None) is None and len(self._values) >= self._most:
             oldest = next(iter(self._values))
@@ -220,7 +220,7 @@ class EventFeed:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        """Keep a drawing. Runs on the client's thread; any number of drawings schedules one call on the loop."""
+        """Keep a drawing. Runs on the client's thread, and schedules only one call on the loop for several drawings."""
         self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
         if not self._waking:
             self._waking = True
@@ -271,7 +271,7 @@ class LogFeed:
 
     @property
     def refused(self) -> int:
-        """Number of logged values refused for lack of a place."""
+        """Number of logged values refused for lack of room."""
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:

@@ -1,4 +1,4 @@
-"""One page's flight after a target that it marked: from the box to set-points and messages. On the event loop.
+"""Fly after a target that a person marked on a page: from the box to set-points and messages, on the event loop.
 
 The content of a box is only tracked until the page sets a mode, either with the box or later
 (:meth:`FollowSession.fly`). In flight, each report from the :class:`~skyloop.cockpit.target_tracker.TargetTracker`
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from skyloop.messages import AnyAction
 
 STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
-OLD_S: Final = 1.0  #: frames older than this when tracked are not used for flying either
+OLD_S: Final = 1.0  #: maximum age of a frame when tracked; older ones also make it hover
 OLD_FEEDBACK_S: Final = 1.0
-#: A request older than this no longer starts a flight: the tracker was stuck, or took longer than anyone expects.
+#: Maximum age of a request that may start a flight: by then the tracker is stuck, or nobody expects a flight any more.
 SET_OFF_S: Final = 10.0
 WATCH_S: Final = 0.1  #: interval between checks that the tracker still reports
 NUMBERS_PERIOD_S: Final = 0.2  #: interval between messages that differ only in numbers
@@ -59,7 +59,7 @@ class FollowerFactory(Protocol):
 
 
 class FollowSession:
-    """Tracks one target at a time for a page and follows it. On the event loop.
+    """Tracks one target at a time for a page and follows it. Used on the event loop.
 
     ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; called
     before the first set-point. ``make``: creates followers; called on a thread.
@@ -129,7 +129,7 @@ class FollowSession:
                 Called only if there is a mode, at the beginning and before the flight.
 
         Raises:
-            AuthorityError: There is a mode, but this page does not hold the authority.
+            AuthorityError: A mode was given, but this page does not hold the authority.
             RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command was given.
             UsageError: The box, mode, distance or camera is invalid.
             MissingExtraError: OpenCV is not installed.
@@ -167,7 +167,7 @@ class FollowSession:
         self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
-        """Follow the tracked target, or change the mode of following.
+        """Follow the tracked target, or change the following mode.
 
         Raise ``RefusedError`` if nothing is tracked, or the vehicle is not in the air, or ``UsageError`` if the mode or
         distance is invalid.
@@ -241,7 +241,7 @@ class FollowSession:
 
     def _set_off(self) -> None:
         """Send the first set-point, ending any other flight."""
-        pilot, self._pilot = self._pilot, None  # otherwise clearing would end this flight, too
+        pilot, self._pilot = self._pilot, None  # so that clearing does not end this flight
         self._clear()
         self._pilot, self._flying, self._action = pilot, True, None
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)

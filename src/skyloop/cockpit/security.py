@@ -27,11 +27,11 @@ from skyloop.messages import Role
 
 LOG_IN: Final = 4401  #: WebSocket close code: not logged in
 NOT_ALLOWED: Final = 4403  #: WebSocket close code: only a pilot may do this
-ADMIT: Final = "admit"  #: key in the connection's state of a function that returns why there is no place for a person
+ADMIT: Final = "admit"  #: key of a function in the connection's state that returns why a person is refused
 _FOREIGN: Final = 1008  # close code: a page from another site
-_LATER: Final = 1013  # close code: currently no place
+_LATER: Final = 1013  # close code: too many connections at present
 
-#: Answered whatever the role: the page itself, and the routes for logging in.
+#: Paths that need no role: those of the page itself and of logging in.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
@@ -62,7 +62,7 @@ class Names:
     """The values of ``Host`` that browsers send when they really mean this server.
 
     ``any_address``: also accept any IP address with the right port, because the server listens on all of the machine's
-    addresses. Unlike a name, an address can't be pointed elsewhere.
+    addresses. Unlike a name, an address can't be redirected.
     """
 
     exact: frozenset[str]
@@ -167,7 +167,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # A host name that is not ours gets no answer that a browser would show.
+        # No browser displays the answer to a request for a host name that is not ours.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (
@@ -185,8 +185,8 @@ def person_of(scope: Scope) -> Person | None:
 async def gone_within(receive: Receive, within_s: float) -> bool:
     """Wait for the client to disconnect.
 
-    ``receive``: the request's function of that name; other messages are dropped. Return whether the client disconnected
-    in time.
+    ``receive``: the request's ``receive`` function; messages other than the disconnect are dropped. Return whether
+    the client disconnected in time.
     """
     try:
         async with asyncio.timeout(within_s):
