@@ -28,9 +28,9 @@ _SMALL: Final = (320, 240)
 def bench(
     what: Annotated[
         What,
-        typer.Argument(help="delays: the channels, beside a bare hand-over of the same bytes; sim: the simulator"),
+        typer.Argument(help="delays: the channels, next to a bare hand-over of the same bytes; sim: the simulator"),
     ],
-    seconds: Annotated[float, typer.Option(min=LEAST_S, help="Duration; for delays, of each of the two")] = 30.0,
+    seconds: Annotated[float, typer.Option(min=LEAST_S, help="Duration; for delays, of each of the two runs")] = 30.0,
     sizes: Annotated[
         str | None, typer.Option(help="delays: frame sizes, such as 320x240,640x480 [default: 320x240]")
     ] = None,

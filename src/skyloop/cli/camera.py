@@ -68,7 +68,7 @@ def board(
     square_mm: SquareMm = 33.0,
     kind: KindOption = Kind.CHARUCO,
     dictionary: Dictionary = "4x4_50",
-    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a picture")] = 300,
+    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a .png")] = 300,
 ) -> None:
     """Write a calibration board; the default fits A4. Print it at 100 %, and glue it onto something flat."""
     made = _board(columns, rows, square_mm, kind, dictionary)
@@ -86,13 +86,13 @@ def calibrate(
         ),
     ] = None,
     drone: DroneOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write")] = Path("camera.json"),
     camera: Annotated[
         str | None, typer.Option(metavar="NAME", help="The vehicle's camera [default: the first]")
     ] = None,
     model: Annotated[Lens, typer.Option(help="Lens model; a fisheye sees more than about 100° across")] = Lens.PINHOLE,
     views: Annotated[int, typer.Option(min=6, max=200, help="Number of views to take from a vehicle or a video")] = 25,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="Longest search for them")] = 180.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="Maximum time to search for them")] = 180.0,
     columns: Columns = 7,
     rows: Rows = 5,
     square_mm: SquareMm = 33.0,

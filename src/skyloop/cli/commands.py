@@ -68,7 +68,7 @@ COMMANDS: Final = {
             "follow": Entry(
                 Task.FLY,
                 "fly:fly_follow",
-                "Follow the target in a box, or of a class",
+                "Follow the target in a box, or one of a class",
                 "fly follow --class person --seconds 60",
                 ("vision", "detect"),
             )
@@ -155,7 +155,7 @@ COMMANDS: Final = {
     "camera": Entry(
         Task.SET_UP,
         "camera:camera",
-        "Print a board, and calibrate a camera by it",
+        "Print a board, and calibrate a camera with it",
         "camera calibrate alpha",
         ("vision",),
     ),

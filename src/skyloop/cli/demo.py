@@ -49,7 +49,7 @@ def demo(
         float | None, typer.Option(min=0.0, help="Duration of following [default: until Ctrl-C]")
     ] = None,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No page; exit code 1 if the marker was in view less than 90 %")
+        bool, typer.Option("--headless", help="No page; exit code 1 if the marker was in view for less than 90 %")
     ] = False,
     world: Annotated[str, typer.Option(help="Name or file of a world")] = "room",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the marker's walk, the noise and the wind")] = 0,

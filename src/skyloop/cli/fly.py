@@ -371,7 +371,7 @@ def fly_follow(
         str | None,
         typer.Argument(
             metavar="[NAME]",
-            help="A running proxy, or a vehicle's address; without: a simulated park",
+            help="A running proxy, or a vehicle's address [default: a simulated park]",
             autocompletion=naming.drone_names,
             show_default=False,
         ),
@@ -381,7 +381,7 @@ def fly_follow(
         str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
     ] = None,
     class_name: Annotated[
-        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person")
+        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest object of a class, e.g. person")
     ] = None,
     detector: Annotated[
         str | None,

@@ -48,7 +48,7 @@ _EXTRA: Final = re.compile(r"\s*(?:\band\s+)?\bextra\s*==\s*[\"']([\w-]+)[\"']")
 
 def install(
     parts: Annotated[list[str], typer.Argument(metavar="PART...", help="Such as vision; all: nearly all of them")],
-    anew: Annotated[bool, typer.Option("--anew", help="Reinstall present packages too, to repair them")] = False,
+    anew: Annotated[bool, typer.Option("--anew", help="Reinstall existing packages too, to repair them")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be installed")] = False,
 ) -> None:
     """Install optional parts of Skyloop into the Python environment that runs this command.

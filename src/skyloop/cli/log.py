@@ -106,7 +106,7 @@ def list_recordings(
         typer.echo(f"No recordings in {folder}. Make one: skyloop record alpha")
 
 
-@log.command(short_help="Make a page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
+@log.command(short_help="Create a page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
 def report(
     file: File,
     output: Annotated[
@@ -208,10 +208,10 @@ def compare(
     old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording", autocompletion=recordings)],
     new: Annotated[
         Path,
-        typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first", autocompletion=recordings),
+        typer.Argument(metavar="NEW", help="Another, such as that of a replay of the first", autocompletion=recordings),
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them, as a .html page or .png image")
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Plot them in a .html page or .png image")
     ] = None,
     drone: DroneName = None,
     what: Annotated[Which, typer.Option(help="Commands as requested, or as applied")] = Which.ASKED,
@@ -243,7 +243,7 @@ def compare(
 def recover(
     file: File,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="NEW", help="[default: FILE-recovered.mcap beside it]")
+        Path | None, typer.Option("-o", "--output", metavar="NEW", help="[default: FILE-recovered.mcap next to it]")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:

@@ -109,7 +109,7 @@ PriorityOption = Annotated[
     int, typer.Option("--priority", metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")
 ]
 WaitOption = Annotated[
-    float, typer.Option("--wait", metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+    float, typer.Option("--wait", metavar="S", min=0.0, help="Maximum wait in the queue for the authority")
 ]
 SecondsOption = Annotated[
     float | None, typer.Option("--seconds", metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")

@@ -278,7 +278,7 @@ def issue(
     _print_roster(lab.directory, [each for each in lab.roster.entries if each.name != name])
 
 
-@keys.command(short_help="Show who has keys, until when", epilog=f"{_EXAMPLE}show")
+@keys.command(short_help="Show who has keys, and until when", epilog=f"{_EXAMPLE}show")
 def show(
     directory: LabOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,

@@ -43,7 +43,7 @@ def process(
         str | None, typer.Option(metavar="NAME", help="Name of the processor [default: the class's, in lower case]")
     ] = None,
     share: Annotated[
-        bool, typer.Option("--share/--all", help="Each frame to one worker of this name, or to all")
+        bool, typer.Option("--share/--all", help="Send each frame to one worker of this name, or to all")
     ] = True,
     workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes to run here")] = 1,
     max_age: Annotated[float, typer.Option(metavar="S", min=0.0, help="Skip frames older than this")] = 1.0,
@@ -51,7 +51,7 @@ def process(
         float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second of a worker")
     ] = None,
     stuck: Annotated[
-        float, typer.Option(metavar="S", min=0.05, help="After this long on one frame, its share goes to others")
+        float, typer.Option(metavar="S", min=0.05, help="Time on one frame after which others get a worker's frames")
     ] = 2.0,
     seconds: naming.SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
@@ -172,7 +172,7 @@ def detect(
         str | None,
         typer.Argument(
             metavar="[FILE]",
-            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, for the simulator's figures",
+            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; default: Skyloop's own, for the simulator's figures",
             show_default=False,
         ),
     ] = None,

@@ -46,7 +46,7 @@ def record(
             metavar="auto|jpeg|png", help="Encoding of frames; auto keeps H.264 unchanged, else jpeg; png is lossless"
         ),
     ] = "auto",
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Quality of JPEG")] = 90,
     rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="Maximum size of a file")] = None,
     rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="Maximum time of a file")] = None,
     min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Disk space to leave free")] = 256.0,
@@ -140,7 +140,7 @@ def view(
     rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback, anyone who reaches it sees the drones"),
+        typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones"),
     ] = "127.0.0.1",
     port: Annotated[
         int | None,

@@ -50,7 +50,7 @@ def sim(
     world: Annotated[str, typer.Option(metavar="WORLD", help="Name or file of the world")] = "room",
     seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed of wind, noise and targets")] = 0,
     speed: Annotated[float, typer.Option(metavar="X", min=0.01, max=100.0, help="Simulated seconds per second")] = 1.0,
-    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy; several are numbered: sim1, sim2, …")] = NAME,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy name; several are numbered: sim1, sim2, …")] = NAME,
     option: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; repeatable"),
@@ -81,23 +81,21 @@ def sim(
     ] = None,
     port_base: Annotated[
         int | None,
-        typer.Option(
-            metavar="P", min=0, max=65000, help="Firmware: count its ports from here, not the usual; 0: any free"
-        ),
+        typer.Option(metavar="P", min=0, max=65000, help="Firmware: first port, instead of the usual one; 0: any free"),
     ] = None,
     lose: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams lost, each way")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams lost, each way")
     ] = None,
     delay: Annotated[
         float | None,
         typer.Option(metavar="S", min=0, max=MOST_DELAY_S, help="Firmware: delay of datagrams, each way [s]"),
     ] = None,
     repeat: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams duplicated")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams duplicated")
     ] = None,
     reorder: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams swapped with the next"),
+        typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams swapped with the next"),
     ] = None,
     video_port: Annotated[
         int | None,
