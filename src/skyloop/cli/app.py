@@ -209,7 +209,7 @@ class Group(TyperGroup):
 class ByTask(Group):
     """All commands in the order of the table, each created on demand."""
 
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  Typer's signature
         """Return the names of the commands in the order used in help."""
         return list(COMMANDS)
 

@@ -54,7 +54,7 @@ Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The markers of a 
 
 @camera.callback()
 def _camera() -> None:
-    """Print a board, calibrate a camera with pictures of it, and list this machine's cameras.
+    """Print a board, calibrate a camera with images of it, and list this machine's cameras.
 
     skyloop camera COMMAND --help describes each.
     """

@@ -88,7 +88,7 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
-        """Fly the demonstration; ``port`` None: the default port for pages. Raise errors of connecting and take-off."""
+        """Fly the demonstration; ``port`` is None for the default. Errors during connecting and take-off are raised."""
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
@@ -126,7 +126,7 @@ class _Demo:
             follower.run(seconds=self.seconds, until=lambda: self._stopped)
 
     def _stop(self) -> None:
-        """End the flight properly on the first Ctrl-C. A second one interrupts Python as usual."""
+        """End the flight properly on the first Ctrl-C. A second Ctrl-C interrupts Python as usual."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()

@@ -107,7 +107,7 @@ def doctor(
 
 
 def examine() -> Iterator[Finding]:
-    """Yield all findings in reading order. A check that breaks is itself a finding."""
+    """Yield all findings in reading order. A check that fails is itself reported."""
     from skyloop.errors import MissingExtraError
 
     checks: dict[str, Callable[[], Iterator[Finding]]] = {

@@ -38,7 +38,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array o
 
 
 class Ending(msgspec.Struct, frozen=True):
-    """How ending one drone's flight turned out."""
+    """The result of ending one drone's flight."""
 
     name: str
     ok: bool

@@ -226,7 +226,7 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Replace the current controller with the loaded one, if possible. The old one can't command any more."""
+        """Replace the current controller with the loaded one, if possible. The old one can then no longer command."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:
@@ -252,7 +252,7 @@ class Flight:
 def what_failed(error: Exception) -> str:
     """Return what the user needs to fix an error: their own line, then the traceback without Skyloop's lines.
 
-    An error raised deliberately by Skyloop, with no line of the user's, becomes one line; any other is shown in full.
+    An error that Skyloop raised deliberately and outside the user's code becomes one line; others are shown in full.
     """
     home = str(Path(__file__).parents[1])
     trace = traceback.TracebackException.from_exception(error)
@@ -408,7 +408,7 @@ def fly_follow(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Take off, follow a target by the camera, land. Without NAME a simulated drone follows a person in a park.
+    """Take off, follow a target with the camera, land. Without NAME a simulated drone follows a person in a park.
 
     Give --class, --box, or both. It does not see walls and trees: fly it where there are none.
 

@@ -1,4 +1,4 @@
-"""Convert a terminal's keys to a pilot's sticks and orders; :class:`Hands` and :class:`Tokenizer` are pure.
+"""Convert a terminal's keys to a pilot's stick positions and commands; :class:`Hands` and :class:`Tokenizer` are pure.
 
 A terminal reports presses and repeats, but never releases. A press therefore moves its stick for :data:`HOLD_S`, which
 is longer than terminals wait before they repeat a key; repeats keep the stick there.
@@ -20,7 +20,7 @@ from skyloop.messages import FlightState
 
 HOLD_S: Final = 0.6  #: how long a press moves its stick
 TWICE_S: Final = 1.0  #: two presses of Esc within this time cut the motors
-REPEAT_S: Final = 0.12  #: a held key repeats faster than this; no finger does
+REPEAT_S: Final = 0.12  #: a held key repeats faster than this, and no finger can
 DELAY_S: Final = 0.2  #: no keyboard starts repeating sooner
 SAME_S: Final = 0.04  #: a second Esc this close to the keyboard's delay may be a repeat of the first
 LANDING_S: Final = 3.0  #: sticks are blocked for this long after L, because the vehicle may not report its landing yet
@@ -324,7 +324,7 @@ class Keyboard:
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
-        """Return the keys pressed, as soon as there are any. Raise ``EOFError`` if the terminal is gone."""
+        """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal is gone."""
         if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)

@@ -30,7 +30,7 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A proxy, as a row of ``list``."""
+    """A proxy as a row in the output of ``skyloop list``."""
 
     name: str
     transport: str = "local"  #: ``local``, ``fabric`` (the network) or both

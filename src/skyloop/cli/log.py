@@ -68,7 +68,7 @@ def info(
     file: File,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems of the file."""
+    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems with the file."""
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)

@@ -44,7 +44,7 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def network_places(incomplete: str) -> list[str]:
-    """Return the network place that is not an address."""
+    """Return ``multicast``, the only network place that is not an address."""
     return [place for place in ("multicast",) if place.startswith(incomplete)]
 
 
@@ -126,8 +126,8 @@ def keys_directory() -> Path:
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
     """Return the drone that a command is for.
 
-    ``default``: used if neither is given; None: a name is required. Raise ``UsageError`` if no drone is given, or two
-    are.
+    ``default``: used if neither is given; if None, a name is required. Raise ``UsageError`` unless exactly one drone is
+    given.
     """
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")

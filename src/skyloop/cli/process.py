@@ -78,7 +78,7 @@ def process(
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
-        pass  # the normal way to end
+        pass  # the normal way to stop
 
 
 def work(

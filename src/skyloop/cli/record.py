@@ -56,7 +56,7 @@ def record(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Record drones to an MCAP file until Ctrl-C. Only observes: any application may fly meanwhile.
+    """Record drones to an MCAP file until Ctrl-C. This only observes: others may fly meanwhile.
 
     If the output is not a terminal, a line is printed each second.
     """
@@ -102,7 +102,7 @@ def _show(recorder: Recorder, seconds: float) -> None:
 
 
 def progress(status: Status, before: Status) -> str:
-    """Return the progress in one line; rates are measured since ``before``."""
+    """Return the progress in one line; rates are relative to ``before``."""
     span_s = max(1e-3, status.seconds - before.seconds)
     minutes, seconds = divmod(round(status.seconds), 60)
     parts = [
@@ -162,7 +162,7 @@ def view(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones live in Foxglove or Rerun until Ctrl-C. Only observes: any application may fly meanwhile.
+    """Show drones live in Foxglove or Rerun until Ctrl-C. This only observes: others may fly meanwhile.
 
     Connect Foxglove to the address shown. A slow or stalled viewer does not slow down anything else.
     """

@@ -58,7 +58,7 @@ def fly(
     wait: WaitOption = 0.0,
     land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
 ) -> None:
-    """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
+    """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal, P pauses, R resumes and S skips."""
     from skyloop.cli import interrupt_by_signals
     from skyloop.cli.fly import ADVICE
     from skyloop.cli.fly import land as put_down

@@ -93,9 +93,9 @@ class Teleop:
                 self._message = self._hands.no_effect or keyboard.other or self._message
 
     def obey(self, order: Order | Deflection) -> None:
-        """Carry out an order. If it is impossible, report that and change nothing.
+        """Carry out a command. If that is impossible, report it and change nothing.
 
-        Only taking control waits for an answer, on a separate thread: meanwhile, an emergency stop still works.
+        Only taking control waits for an answer. It does so on a separate thread, so that an emergency stop still works.
         """
         if order != "take":
             self._carry_out(order)

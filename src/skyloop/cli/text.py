@@ -1,4 +1,4 @@
-"""Text for terminals and pipes, and errors in terms of the command line: the problem, and the words to type."""
+"""Format text for terminals and pipes, and explain errors in terms of the command line."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def json_text(value: Any) -> str:
 
 
 def coloured(line: str, stream: TextIO | None) -> str:
-    """Return a line with its beginning coloured, if that has a meaning and the stream shows colours.
+    """Return a line with its beginning coloured, if it has a known meaning and the stream shows colours.
 
     A stream shows colours if it is a terminal, not a dumb one, and ``NO_COLOR`` is not set (https://no-color.org).
     ``stream``: where the line is printed; None if that was closed before Python started.

@@ -238,7 +238,7 @@ class TokenGate:
         return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
-        """Return the owner of a token, None if it is unknown. A nearly right token takes as long as any other."""
+        """Return the owner of a token, or None if it is unknown, in a time that reveals nothing about known tokens."""
         given = token.encode()[: MAX_TOKEN + 1]
         found = None
         for one in self._tokens:
@@ -389,7 +389,7 @@ class WrongTokens:
     def __init__(self, clock: Clock = monotonic_ns) -> None:
         self.count = 0  #: number of wrong tokens since the start
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # count and time of the last; quietest address first
+        self._of_address: dict[str, tuple[int, int]] = {}  # wrong tokens and time of the last; quietest first
         self._minute_ns = clock()
         self._in_minute = 0
 

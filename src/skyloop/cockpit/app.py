@@ -141,7 +141,7 @@ def _read(full: str, stamp: tuple[int, int]) -> _File:
 
 
 STATIC = Path(__file__).with_name("static")
-_THREADS: Final = 32  # for blocking work: proxies that answer late, recorders that take time to end
+_THREADS: Final = 32  # number of threads for blocking work, such as waiting for proxies and recorders
 
 
 class Cockpit:

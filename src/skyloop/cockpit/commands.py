@@ -16,7 +16,7 @@ Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
 LATE_S: Final = 0.5  #: a command that may be older is refused, because its sender no longer expects it to be obeyed
-#: Maximum age of an emergency stop; the page shows the stop as pending for as long.
+#: Maximum age of an emergency stop; the page shows the stop as pending for this long.
 STOP_LATE_S: Final = 2.0
 #: If pushed sticks have not moved for this long, nobody is assumed to hold them. Bluetooth can take up to 20 s to
 #: report a lost gamepad.
@@ -62,7 +62,7 @@ class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover at a person's request or, without taking control from others, because no key or stick is held."""
+    """Hover at a person's request or, if ``automatic``, because no input is held; the latter never takes control."""
 
     automatic: bool = False
 
@@ -143,7 +143,7 @@ class FollowTarget(Command, frozen=True, tag="follow"):
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
-    """Follow the tracked target, or change the mode of following."""
+    """Follow the tracked target, or change the following mode."""
 
     mode: Word
     distance_m: float | None = None  #: distance to keep; None: unchanged

@@ -44,7 +44,7 @@ SILENT_S: Final = 0.5  #: a page that flies but sends nothing for this long is c
 GONE_S: Final = 2.0
 _REFUSE_AGAIN_S: Final = 1.0  # interval between equal refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-# Time after which a take-off is no longer repeated: until the proxy acknowledges it, and until the vehicle begins it.
+# Time limits for repeating a take-off: without and with an acknowledgement by the proxy.
 _TAKEOFF_NS: Final = 1_000_000_000
 _BEGUN_NS: Final = 6_000_000_000
 _numbers = itertools.count(1)
@@ -53,7 +53,7 @@ Json = dict[str, Any]
 
 
 class ControlSession:
-    """Serves one control socket of a page from opening to closing. On the event loop."""
+    """Serves one control socket of a page from opening to closing. Used on the event loop."""
 
     def __init__(
         self,
@@ -410,7 +410,7 @@ class ControlSession:
 
         def held() -> PilotConnection:
             if self._decisions != number:
-                raise RefusedError("another command has been given since, or the page stopped sending")
+                raise RefusedError("another command was given, or the page was silent")
             if problem := untimely(command, seconds(self._clock())):
                 raise RefusedError(problem)
             return self._held()
@@ -440,7 +440,7 @@ class ControlSession:
         route = self._route is not None and self._route.is_under_way
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
-    def _end_flight(self, why: str = "something else was commanded, or the page was silent") -> None:
+    def _end_flight(self, why: str = "another command was given, or the page was silent") -> None:
         """End the page's previous flight. A route is only paused and can be resumed."""
         self._decisions += 1
         if self._decided != self._last_command:  # earlier intents and their refusals belong to the previous command
@@ -489,7 +489,7 @@ class ControlSession:
     # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Send changes of the authority and of open questions to the page, and report completed commands."""
+        """Send changes in the authority and in open questions to the page, and report completed commands."""
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
@@ -530,7 +530,7 @@ class ControlSession:
             self.let_go(outcome.text)  # this feedback also shows whether others have taken control
         elif self._last_command[0] == commands.TakeOff().do:
             with suppress(SkyloopError):
-                pilot.idle()  # otherwise it would take off unexpectedly as soon as it can
+                pilot.idle()  # otherwise it would take off unexpectedly as soon as it could
         self._awaited = None
 
     def _refuse(self, do: str, n: int, why: str) -> None:

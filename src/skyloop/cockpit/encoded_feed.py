@@ -45,8 +45,8 @@ def _give_way() -> None:
 #: original priority: a person's sticks and stop pass through it, and a browser must not starve it.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
 KEPT: Final = 16  #: pictures kept per stream; a page further behind resumes at a key frame
-SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: few, so that panes of similar sizes share a stream
-RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: few as well [kbit/s]
+SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: few scales, so that similar panes share a stream
+RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: few rates [kbit/s]
 BITS: Final = 0.12  #: bits per pixel of a moving picture
 _FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
@@ -220,7 +220,7 @@ class SmallFeed:
         self._pages += 1
 
     def unsubscribe(self) -> None:
-        """Remove a page that showed the camera; the last one unsubscribes from the camera."""
+        """Remove a page that no longer shows the camera; without pages, unsubscribe from the camera."""
         self._pages -= 1
         if self._pages == 0:
             self.close()

@@ -42,13 +42,13 @@ V = TypeVar("V")
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread. Do nothing if the loop is closed, because no pages are left."""
+    """Call a function on the loop, from any thread. Do nothing if the loop is closed and no pages are left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
 
 
 def start_task(work: Coroutine[Any, Any, None], running: set[asyncio.Task[None]]) -> None:
-    """Run a coroutine as a task, which stays in the set until it has ended: the loop itself keeps no task alive."""
+    """Run a coroutine as a task, which stays in the set until it has ended, because the loop does not keep it alive."""
     task = asyncio.create_task(work)
     running.add(task)
     task.add_done_callback(running.discard)
@@ -126,7 +126,7 @@ class Newest(Generic[K, V]):
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: number of values refused for lack of a place
+        self.refused = 0  #: number of values refused for lack of room
         self._most = most
         self._clock = clock
         self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the most recently updated comes last
@@ -211,7 +211,7 @@ class EventFeed:
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return the events with higher numbers, together with these numbers, oldest first."""
+        """Return the events numbered above ``number``, with their numbers, oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
@@ -252,7 +252,7 @@ class LogFeed:
         self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe; or unsubscribe and forget the values."""
+        """Subscribe if the values are wanted; otherwise unsubscribe and forget them."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),

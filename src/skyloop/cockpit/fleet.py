@@ -79,7 +79,7 @@ class Fleet:
         self._clock = clock
         self._search_period_s = look_s
         self._seen_ns: dict[str, int] = {}
-        self._found: dict[str, Found] = {}  # as found in the last search
+        self._found: dict[str, Found] = {}  # the proxies found by the last search
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
@@ -109,7 +109,7 @@ class Fleet:
         start_task(work, self._begun)
 
     async def search(self) -> None:
-        """Search once: start connecting to new proxies, and remove those that are gone for good."""
+        """Search once: start connecting to new proxies, and remove those that are gone permanently."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -136,7 +136,7 @@ class Fleet:
 
     @property
     def unreached(self) -> dict[str, str]:
-        """Drones that were found but can't be commanded because they are not connected; reasons by name."""
+        """Names of drones that were found but are not connected and can't be commanded, with the reasons."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from skyloop.messages import AnyAction
 
 STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
-OLD_S: Final = 1.0  #: maximum age of a frame when tracked; older ones also make it hover
+OLD_S: Final = 1.0  #: the vehicle also hovers if a frame is older than this when it is tracked
 OLD_FEEDBACK_S: Final = 1.0
 #: Maximum age of a request that may start a flight: by then the tracker is stuck, or nobody expects a flight any more.
 SET_OFF_S: Final = 10.0
@@ -84,7 +84,7 @@ class FollowSession:
         self._mode = ""
         self._distance_m = 0.0
         self._limits: dict[str, Value] = {}  # the drone's limits, read when the target was marked
-        self._pilot: PilotConnection | None = None  # set while it flies or is about to
+        self._pilot: PilotConnection | None = None  # set while it is flying or about to fly
         self._flying = False
         self._waits = ""  # why it is currently hovering
         self._action: AnyAction | None = None  # the last set-point
@@ -187,7 +187,7 @@ class FollowSession:
         self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End a flight because something else was commanded or control was lost; tracking continues."""
+        """End a flight because another command was given or control was lost; tracking continues."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -195,7 +195,7 @@ class FollowSession:
         """Forget the target.
 
         ``why``: the reason shown on the page; empty if the person requested it. ``hover``: whether to hover if the
-        vehicle was following; False if something else is commanded.
+        vehicle was following; False if another command is given.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:

@@ -31,7 +31,7 @@ from skyloop.messages import Role
 MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
 MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six connections, and several browsers may share an address
 MAX_KNOWN: Final = 512  #: a page that shows a drone with two cameras has about eight
-MAX_KNOWN_OF_ADDRESS: Final = 192  #: per role: a classroom may be behind one router
+MAX_KNOWN_OF_ADDRESS: Final = 192  #: limit per role; a whole classroom may share one address
 _PILOTS_SHARE: Final = 0.25  # fraction of the known connections reserved for pilots
 DESCRIPTORS_LEFT: Final = 128  #: descriptors reserved for drones, recordings, child processes and files
 
@@ -322,7 +322,7 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # by message without values: time, number dropped since
+        self._logged: dict[str, tuple[int, int]] = {}  # time and number dropped since, by message without values
 
     def filter(self, record: logging.LogRecord) -> bool:
         key, now_ns = f"{record.name} {record.msg}", self._clock()

@@ -95,7 +95,7 @@ class PlaceFlight:
         self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
-        """Stop monitoring, because something else was commanded."""
+        """Stop monitoring, because another command was given."""
         self._station.goals.pop(self._app, None)
         if self._job is not None:
             self._job.cancel()
@@ -182,7 +182,7 @@ class RouteSession:
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
-        """End the route permanently. Without ``hover``, something else was commanded or control was lost."""
+        """End the route permanently. ``hover``: False if another command was given or control was lost."""
         if self._job is not None:
             self._job.cancel()
         self._carry_out(self.law.stop(), send=hover)

@@ -1,10 +1,10 @@
 """Decide which requests are answered, from the page they come from and the person who sent them. Guards all routes.
 
 A page from another site can make a browser send requests to this server. Three checks prevent that. The ``Host`` header
-must name this server (otherwise a foreign name was pointed at it: DNS rebinding). The ``Origin``, which browsers add to
-every WebSocket and every request that changes something, and which pages can't forge, must be that of this page; a link
-has no origin, but ``Sec-Fetch-Site`` shows where it comes from, and a foreign link may only lead to the page itself.
-Finally, the page may load only its own files and can't be framed (Content-Security-Policy).
+must name this server, to prevent DNS rebinding. The ``Origin`` must be that of this page: browsers add it to every
+WebSocket and every request that changes something, and pages can't forge it. A link has no origin, but
+``Sec-Fetch-Site`` shows where it comes from: a link from another site may only lead to the page itself. Finally, the
+page may load only its own files and can't be framed (Content-Security-Policy).
 
 After these checks the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
 needs: observer by default, pilot for routes that change something.
@@ -31,7 +31,7 @@ ADMIT: Final = "admit"  #: key of a function in the connection's state that retu
 _FOREIGN: Final = 1008  # close code: a page from another site
 _LATER: Final = 1013  # close code: too many connections at present
 
-#: Paths that need no role: those of the page itself and of logging in.
+#: Paths open to everyone: the page itself and the routes for logging in.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
@@ -214,7 +214,7 @@ async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: in
         await send({"type": "http.response.body", "body": reason.encode()})
         return
     await receive()
-    if code != _FOREIGN:  # our own page gets the reason; browsers hide it for a socket that never opened
+    if code != _FOREIGN:  # accept first: browsers only report the reason for a socket that was open
         await send({"type": "websocket.accept"})
     await send({"type": "websocket.close", "code": code, "reason": reason})
 

@@ -102,7 +102,7 @@ def serve_cockpit(
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) arrives.
 
     Args:
-        names: The drones to show; if empty, all that are found at any time.
+        names: The drones to show; if empty, every drone discovered, including any that appear later.
         port: The TCP port; 0 selects a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
             free one).
         access: Who may connect, and from where; by default this user, on this machine, as a pilot.

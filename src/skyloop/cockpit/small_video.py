@@ -1,6 +1,6 @@
-"""Small video streams of many drones for one page: one socket, at a steady rate, one message for all cameras.
+"""Send small video streams from many drones to a page over one socket, at a steady rate, in joint messages.
 
-Otherwise a page that shows twelve drones would need twelve sockets, and would wake up and paint for every frame.
+Otherwise, a page that shows twelve drones would need twelve sockets, and would wake up and repaint for every frame.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class PilotConnection(Drone):
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
-        """Repeat commands only while the page is known to be present, because a person flies with it."""
+        """Repeat commands only while the page is known to be present, because a person is flying with it."""
         commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
@@ -126,7 +126,7 @@ class PilotConnection(Drone):
 
     @property
     def is_flying(self) -> bool:
-        """Whether the vehicle is under way, as far as known."""
+        """Whether the vehicle is flying rather than hovering, according to the newest feedback."""
         try:
             return self.feedback().state is FlightState.FLYING
         except LinkError:
@@ -146,7 +146,7 @@ class FlyingSession(Protocol):
         """Send no more commands."""
 
     def let_go(self, why: str) -> None:
-        """Hover if the vehicle is under way because of this page."""
+        """Hover if this page is flying the vehicle."""
 
 
 class Station:
@@ -317,7 +317,7 @@ class Station:
             for session in self.sessions:
                 try:
                     session.stand_down("the motors were stopped")
-                except Exception:  # noqa: BLE001  (the motors are stopped whatever fails in one page)
+                except Exception:  # noqa: BLE001  (a failure of one page must not prevent the stop)
                     _log.exception("%s could not stand down", session.app)
             stopper = await self._send_stop(until_ns)
             sent()

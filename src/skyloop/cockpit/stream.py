@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 LATE_S: Final = 0.25  #: a picture acknowledged after more than this is late
 FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all pictures were late for this long
-QUIET_S: Final = 10.0  #: after this long without a late picture it shares a stream again; doubles with each relapse
+QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stream again; doubled after a relapse
 MOST_QUIET_S: Final = 160.0
 SILENT_S: Final = 3.0  #: give up on a stream after this long without a picture
 RETRY_S: Final = 10.0  #: first pause before trying the stream again, doubled each time
@@ -54,7 +54,7 @@ class PagePath:
         self.late_here = False  #: whether pictures were already late when they reached the cockpit
         self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time sent
         self._trip_s = 0.0  # round-trip time of the newest acknowledged picture
-        self._changed_ns: int | None = None  # time since when all pictures have been late, or none
+        self._changed_ns: int | None = None  # time when pictures last became late, or punctual
         self._was_late = False
         self._quiet_s = QUIET_S
         self._back_ns: int | None = None
@@ -305,7 +305,7 @@ class VideoSender:
             while not receiver.done():
                 self._choose()
                 with suppress(TimeoutError):
-                    # Even without pictures this must notice that none arrive, or that the page accepts none.
+                    # Wake up regularly, to detect that no pictures arrive or that the page accepts none.
                     await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
                 self._wake.clear()
                 await self._send_pictures()

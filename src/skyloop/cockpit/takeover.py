@@ -125,7 +125,7 @@ class QueueTracker:
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the page's position in the queue.
 
-        Return None if the page does not wait, otherwise a value equal to the previous one until the status changes.
+        Return None if the page is not waiting. Otherwise, the value only changes when the status does.
         """
         if status.state == "held":  # a pilot that was overruled later gets the authority back without asking
             self.request(ask=False)

@@ -55,7 +55,7 @@ class KeptFrames:
         return len(self._frames)
 
     def add(self, arrival: Arrival) -> None:
-        """Add a frame. If it was captured before the newest one (the proxy restarted), discard the others."""
+        """Add a frame. If the newest one was captured later (the proxy restarted), discard the frames kept so far."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
         self._frames.append(arrival)

@@ -142,7 +142,7 @@ def _known(text: Value | None) -> WorldGeometry | None:
     try:
         return decode_world(text)
     except ValueError:
-        return None  # a driver uses this name for something else
+        return None  # the driver uses this parameter name for another value
 
 
 def _limit(value: Value | None) -> float | None:
