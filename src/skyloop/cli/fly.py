@@ -226,7 +226,7 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Replace the current controller with the loaded one, if possible. The old one can then no longer command."""
+        """Replace the current controller with the loaded one, if possible. The old one can then no longer fly it."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:

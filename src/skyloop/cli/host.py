@@ -137,7 +137,7 @@ def remove(
 ) -> None:
     """Land a vehicle of a running host, and stop serving it.
 
-    Refused while the vehicle flies under an application's authority, unless --land is given.
+    This is refused while the vehicle flies under an application's authority, unless --land is given.
     """
     from skyloop.host.serve import Remove
 

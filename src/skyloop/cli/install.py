@@ -118,6 +118,6 @@ def _is_there(module: str) -> bool:
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Extend an error that names one part to install, so that it names all missing ones of ``parts``."""
+    """Extend an error about one missing part, so that it names all those of ``parts`` that are missing."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

@@ -72,7 +72,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return text saying that no proxy was found here or on the network searched, and whose proxies run here."""
+    """Return a message that no proxy was found here or on the network, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"

@@ -155,7 +155,7 @@ def export(
 
     H.264 is copied as recorded, which takes seconds, unless the time is drawn on the frames. For lerobot, flights
     become episodes of a LeRobotDataset: pictures, the state when each was captured, and the commands. rrd is a file for
-    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording itself.
+    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording directly.
     """
     from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4

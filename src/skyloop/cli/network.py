@@ -194,9 +194,7 @@ def router(
         typer.echo(config.to_json(config.make(chosen, Part.ROUTER)))
         return
     if chosen.tls is None:
-        typer.echo(
-            "WARNING: a router without keys: anyone who reaches it can watch and fly the drones behind it", err=True
-        )
+        typer.echo("WARNING: a router without keys: anyone who can reach it can watch and fly its drones", err=True)
     ended = threading.Event()
 
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -219,7 +219,7 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # the normal way to end
+    with contextlib.suppress(KeyboardInterrupt):  # the normal way to stop
         work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 

@@ -170,7 +170,7 @@ def view(
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to end
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to stop
         from skyloop.client import connect as connect_to
         from skyloop.recording.taps import View, give_way
 
@@ -192,7 +192,7 @@ def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int
     typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")
     if not is_loopback(host):
         typer.echo(
-            f"WARNING: anyone who reaches {host} sees the drones: Foxglove's protocol has no passwords", err=True
+            f"WARNING: anyone who can reach {host} sees the drones: Foxglove's protocol has no passwords", err=True
         )
     return server
 

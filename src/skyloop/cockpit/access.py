@@ -102,7 +102,7 @@ def _table_entry(end: Endpoint, mapped: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """The sender of a request, as far as known; ``name`` may be empty."""
+    """The sender of a request; ``name`` is empty if unknown."""
 
     role: Role
     name: str = ""
@@ -247,7 +247,7 @@ class TokenGate:
         return found
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
-        """Return who logs in with a token or a pairing code, which is used up; None if it is neither."""
+        """Return the person who has this token or pairing code, and use a code up; None if it is neither."""
         found = self.known(token)
         if found is None and self.pairing is not None:
             found = self.pairing.person(token, _address(scope))
@@ -437,7 +437,7 @@ class SessionFile:
     """Stores the sessions of one cockpit, so that after a restart a page reconnects without logging in again.
 
     Only this user may read the file, next to the proxies' sockets. It contains hashes of cookies and tokens, which
-    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates it.
+    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:

@@ -223,7 +223,7 @@ def late_s(command: Command) -> float:
 
 
 class HandWatch:
-    """Determines whether a hand holds the pushed sticks. Pure.
+    """Determines whether a hand is holding the pushed sticks. Pure.
 
     Hands are never still: a finger moves by pixels, a held key repeats, an axis at its limit jitters. The values from a
     gamepad that has lost its radio link stay constant, as do those of a page that has lost track of held keys.

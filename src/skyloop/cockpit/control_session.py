@@ -147,7 +147,7 @@ class ControlSession:
             finally:
                 self._station.sessions.discard(self)
 
-    # Messages of the page --------------------------------------------------------------------------------------
+    # Messages from the page ------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
         """Carry out the page's commands. Of the stick commands that have queued up, use only the newest."""
@@ -417,7 +417,7 @@ class ControlSession:
 
         return held
 
-    # The dead-man ----------------------------------------------------------------------------------------------
+    # The dead-man switch ---------------------------------------------------------------------------------------
 
     def _restart_silence_timer(self) -> None:
         """Restart the timer after a sign of life from the page."""

@@ -101,7 +101,7 @@ class FollowSession:
         """Whether it commands the vehicle, or is about to."""
         return self._pilot is not None
 
-    # Requests of the page --------------------------------------------------------------------------------------
+    # Requests from the page ------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
         """Keep the frames of a camera until a box arrives or the page cancels.
@@ -126,7 +126,7 @@ class FollowSession:
         Args:
             command: The page's command.
             held: Returns the connection that holds the authority; raises if there is none or a newer command was given.
-                Called only if there is a mode, at the beginning and before the flight.
+                Called only if a mode is given, at the beginning and before the flight.
 
         Raises:
             AuthorityError: A mode was given, but this page does not hold the authority.

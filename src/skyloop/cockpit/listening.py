@@ -188,7 +188,7 @@ class Admission:
 
 
 BACKLOG: Final = 1024  #: connections queued by the kernel; a client retries a dropped one after 1 s
-AT_ONCE: Final = 16  #: connections accepted before the open ones get a turn
+AT_ONCE: Final = 16  #: number of connections accepted before open ones are served again
 PAUSE_S: Final = 0.1  #: pause after the system refused a connection for lack of resources
 SWEEP_S: Final = 0.5  #: interval between sweeps that close silent connections
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)

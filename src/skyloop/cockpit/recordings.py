@@ -1,8 +1,8 @@
 """Recordings on the page: start, stop, list, replay and report on them.
 
-Recorders, reports and replays each run in their own process, and nothing blocks the event loop. A recorder is a child
-process that does not disturb the flight, as is a process that creates a report; a replay is a private proxy. All of
-them end when this process ends for any reason. The number of each is limited, and they start one at a time.
+Recorders, reports and replays each run in their own process, so that they neither disturb flights nor block the event
+loop; the process of a replay is a private proxy. All of them end when this process ends for any reason. The number of
+each is limited, and they start one at a time.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # No browser displays the answer to a request for a host name that is not ours.
+        # A request for another host name is refused, so its policy needs no host.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (

@@ -135,7 +135,7 @@ class SmallVideoSender:
             if self._problem:
                 await self._socket.close(_BAD_MESSAGE, self._problem)
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             for shown in self._shown.values():
                 shown.release()

@@ -54,7 +54,7 @@ class PagePath:
         self.late_here = False  #: whether pictures were already late when they reached the cockpit
         self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time sent
         self._trip_s = 0.0  # round-trip time of the newest acknowledged picture
-        self._changed_ns: int | None = None  # time when pictures last became late, or punctual
+        self._changed_ns: int | None = None  # time of the last change of ``_was_late``
         self._was_late = False
         self._quiet_s = QUIET_S
         self._back_ns: int | None = None
@@ -314,7 +314,7 @@ class VideoSender:
             if not receiver.result():
                 await self._socket.close(_BAD_MESSAGE, 'expected {"ack": number of a frame}')
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             if self._as_jpeg:
                 self._feed.unsubscribe(self._wake.set)
@@ -455,7 +455,7 @@ class BroadcastSender:
             elif gone.result() != "websocket.disconnect":
                 await self._socket.close(_BAD_MESSAGE, "no messages are expected here")
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             self._broadcast.unsubscribe(wake)
             gone.cancel()

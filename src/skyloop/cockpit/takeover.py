@@ -34,7 +34,7 @@ class TakeoverQuestion:
     declined: bool = False  #: whether this page refused; a higher priority still gets the authority on expiry
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the question as JSON values; ``now_ns`` is the proxy's clock."""
+        """Return the question as JSON values; ``now_ns`` is on the proxy's clock."""
         return {
             "id": self.query.by_id,
             "by": self.query.request.by,
@@ -99,7 +99,7 @@ class QueuePosition:
     declined: str | None  #: the holder's reason for keeping it, which may be empty; None if it did not decline
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the position as JSON values; ``now_ns`` is the monotonic clock."""
+        """Return the position as JSON values; ``now_ns`` is on the monotonic clock."""
         wait_s = None if self.until_ns is None else max(0.0, seconds(self.until_ns - now_ns))
         return {"position": self.position, "wait_s": wait_s, "asked": self.asked, "declined": self.declined}
 
@@ -253,7 +253,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is higher than the holder's, as far as known."""
+        """Return whether a priority is known to be higher than the holder's."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:

@@ -7,7 +7,7 @@
     print(pages.frames, pages.newest_age_s)
 
 Each page opens the telemetry and video of one drone and acknowledges every frame, as a page in a browser does after
-drawing it. Nothing is decoded, because drawing costs only the browser.
+drawing it. Nothing is decoded, because drawing costs the cockpit nothing.
 """
 
 from __future__ import annotations
