@@ -280,9 +280,9 @@ class FlightProgress:
 
     Args:
         drone: The drone.
-        live: Whether to update one line in place; None: only if standard error is a terminal.
+        live: Whether to update one line in place; if None, only if standard error is a terminal.
         what: Returns the state of the flight, shown at the beginning of the line.
-        every_s: Interval between lines if standard error is not a terminal; None: :data:`LINE_EVERY_S`.
+        every_s: Interval between lines if standard error is not a terminal; if None, :data:`LINE_EVERY_S`.
     """
 
     def __init__(

@@ -230,7 +230,7 @@ class DetectionProcessor:
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
-        """Set the detector, called on the worker's thread, and the names of the classes to publish; empty: all."""
+        """Set the detector, called on the worker's thread, and the names of the classes to publish, or none for all."""
         self._detector = detector
         self._classes = frozenset(classes)
 

@@ -231,10 +231,10 @@ class Serving:
     """The addresses of the emulated drones, and the faults applied to their datagrams."""
 
     bind: str
-    port_base: int | None  #: None: the usual ports
+    port_base: int | None  #: first port; None for the usual ones
     faults: Faults
     delay_s: float
-    video_port: int | None = None  #: for autopilots: port to which images are sent; None: none
+    video_port: int | None = None  #: for autopilots: port to which video is sent; None for no video
 
 
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:

@@ -136,17 +136,17 @@ class FollowTarget(Command, frozen=True, tag="follow"):
     camera: CameraName
     captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: capture time of the frame under the box [ns]
     box: tuple[float, float, float, float]  #: x and y of its upper left corner, width and height [pixels]
-    mode: Word | None = None  #: None: only track until a mode is set
+    mode: Word | None = None  #: if None, only track until a mode is set
     class_name: Word | None = None  #: class of a selected detection
-    distance_m: float | None = None  #: distance to keep; None: the follower's default
-    size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None: the frame's size
+    distance_m: float | None = None  #: distance to keep; None for the follower's default
+    size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None for the frame's size
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
     """Follow the tracked target, or change the following mode."""
 
     mode: Word
-    distance_m: float | None = None  #: distance to keep; None: unchanged
+    distance_m: float | None = None  #: distance to keep; None for no change
 
 
 class StopFollowing(Command, frozen=True, tag="follow_stop"):

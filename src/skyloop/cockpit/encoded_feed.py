@@ -47,7 +47,7 @@ _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
 KEPT: Final = 16  #: pictures kept per stream; a page further behind resumes at a key frame
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: few scales, so that similar panes share a stream
 RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: few rates [kbit/s]
-BITS: Final = 0.12  #: bits per pixel of a moving picture
+BITS: Final = 0.12  #: bits per pixel of a video stream
 _FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
 
@@ -268,8 +268,8 @@ class Form:
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
     """Return the encoding shared by all panes of about the same size.
 
-    ``width``: width of the pane [device pixels]; 0: full size. ``max_fps``: maximum number of pictures per second;
-    None: all.
+    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum number of pictures per second,
+    None for no limit.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -371,7 +371,7 @@ class EncodedFeed:
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
         """Return the next pictures for a page, in order, and the number of pictures skipped before them.
 
-        ``serial``: number of the last picture sent to the page; 0: none yet. ``follows``: whether the page can decode
+        ``serial``: number of the last picture sent to the page, or 0. ``follows``: whether the page can decode
         the next picture; if not, it resumes at a key frame.
         """
         with self._lock:

@@ -96,7 +96,7 @@ class Replay:
 
     drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
-    recorded: str | None  #: the drone's name in the recording; None: the first one
+    recorded: str | None  #: the drone's name in the recording; None for the first one
 
 
 def progress(status: Status) -> dict[str, Any]:

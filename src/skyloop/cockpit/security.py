@@ -127,7 +127,7 @@ class Guard:
     """ASGI middleware that decides which requests are answered, and adds protective headers to every answer.
 
     :func:`foreign` and :func:`needed` determine which requests it refuses; it stores the sender of all others in
-    ``scope["person"]`` (None: a stranger).
+    ``scope["person"]`` (None for a stranger).
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:

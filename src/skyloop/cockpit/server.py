@@ -112,7 +112,7 @@ def serve_cockpit(
         stop: Stops the server when set from any thread.
         network: Also show drones reachable over this network.
         world: File or name of a shipped world, used as the surroundings of drones that don't report any.
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: no endpoint.
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None for no endpoint.
 
     Raises:
         UsageError: An address, port or file is invalid.

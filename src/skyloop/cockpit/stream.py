@@ -116,7 +116,7 @@ class Sent:
 class PageStream:
     """One camera's H.264 stream to one page.
 
-    ``width``: width of the pane [device pixels]; 0: full size. ``max_fps``: maximum frame rate; None: all pictures.
+    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum frame rate, None for no limit.
     ``wake``: called on the event loop for each picture; None if the page polls.
     """
 

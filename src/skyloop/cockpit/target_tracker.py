@@ -266,8 +266,8 @@ class TargetTracker:
         clock: Clock = monotonic_ns,
     ) -> None:
         self.steers = False  #: whether to compute set-points
-        self.mode = ""  #: mode to apply with the next step; empty: unchanged
-        self.settings: Any = None  #: settings to apply with the next step; None: unchanged
+        self.mode = ""  #: mode to apply with the next step; empty for no change
+        self.settings: Any = None  #: settings to apply with the next step; None for no change
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
