@@ -84,7 +84,7 @@ def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
 
 
 def _alone(name: str, entry: Entry) -> Any:
-    """Return one command as a command line of its own."""
+    """Return one command as a separate command line."""
     own = typer.Typer(add_completion=False, rich_markup_mode=None)
     function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
     own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)

@@ -83,8 +83,8 @@ def return_to_start(
 
     Each drone climbs, flies straight to a point above its start and lands; nothing keeps several drones apart on the
     way. A drone flown by another application is reported and left alone, unless --priority is higher (a lower number).
-    Exit code 1 if a drone has not landed at its start: such a drone, and every drone after Ctrl-C, hovers, then lands 5
-    s later if nobody flies it.
+    Exit code 1 if a drone has not landed at its start. Such a drone, and every drone after Ctrl-C, hovers and lands 5
+    s later unless someone flies it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)

@@ -300,7 +300,7 @@ class Keyboard:
         self._set_mode()
         self._continued = signal.signal(
             signal.SIGCONT, lambda *_: self._set_mode()
-        )  # a shell has set its own mode in the meantime
+        )  # while suspended, a shell has set its own mode
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -165,7 +165,7 @@ class Teleop:
         return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
-        """Return the whole display, most important first: whatever does not fit is cut off at the bottom."""
+        """Return the whole display, most important first; the end is cut off if it does not fit."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone

@@ -112,7 +112,7 @@ class Person:
         return self.role is Role.PILOT or role is Role.OBSERVER
 
     def display_name(self, requested: str) -> str:
-        """Return the name shown to others; ``requested`` is used only for people without a name of their own."""
+        """Return the name shown to others; ``requested`` is used only if the person's token or certificate has none."""
         return self.name or " ".join("".join(filter(str.isprintable, requested)).split())[:MAX_NAME]
 
 

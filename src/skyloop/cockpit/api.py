@@ -40,7 +40,7 @@ _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
-    (ClosedError, 404),  # a replay that has ended in the meantime
+    (ClosedError, 404),  # a replay that has just ended
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),

@@ -8,7 +8,7 @@
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, in JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
-``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, who has control
+``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, the pilot
 ======================================  ==================================================================
 """
 

@@ -403,7 +403,7 @@ class ControlSession:
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
         """Return a check to use in place of :meth:`_held` in a job that waits for answers.
 
-        The check raises :class:`RefusedError` if another command has flown or ended a flight in the meantime (the
+        The check raises :class:`RefusedError` if another command has flown or ended a flight since then (the
         newest decision wins), or if the command has become too old.
         """
         number = self._decisions

@@ -312,7 +312,7 @@ def limit_messages() -> None:
 
 
 class RepeatLimit(logging.Filter):
-    """A log filter that passes each message once per ``every_s`` [s], with the number of those dropped in between.
+    """A log filter that passes each message once per ``every_s`` [s], with the number of repeats that were dropped.
 
     Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
     one that it passed longest ago.

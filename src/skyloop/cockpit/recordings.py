@@ -313,7 +313,7 @@ class Recordings:
     def _past(self) -> list[Json]:
         found = []
         for path in self._files():
-            with suppress(OSError):  # deleted in the meantime
+            with suppress(OSError):  # the file has just been deleted
                 status = path.stat()
                 found.append((status.st_mtime_ns, path, status.st_size))
         newest = sorted(found, reverse=True)[:MOST_LISTED]

@@ -273,7 +273,7 @@ class AuthorityReport:
         )
 
     def _why(self, ended: str, holder: str | None, lost: bool) -> str:
-        """Explain how the page lost control, and who has control now."""
+        """Explain how the page lost control, and name the current pilot."""
         name = self._station.found.name
         now = f"{holder} has control" if holder else "nobody has control"
         if ended == "link" and lost:

@@ -396,6 +396,6 @@ class TelemetryView:
             }
             self._channels = {name: channel_values(one) for name, one in stats.items()}
         except LinkError:
-            pass  # closed in the meantime
+            pass  # the drone has just been closed
         finally:
             self._channels_task = None
