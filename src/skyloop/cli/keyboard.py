@@ -308,7 +308,7 @@ class Keyboard:
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
 
     def _set_mode(self) -> None:
-        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S blocks nothing."""
+        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S has no effect."""
         termios = self._termios
         self._tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)

@@ -29,7 +29,7 @@ _PLAIN: Final = {
 }
 _RED: Final = 31
 _YELLOW: Final = 33
-#: Beginnings of lines, and their colours.
+#: Colours of lines, by the words that they begin with.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 

@@ -355,7 +355,7 @@ class TargetTracker:
         self._frame_ns = self._clock()
         self._frame_age_s = frame.age_s
         self._size = frame.shape[1], frame.shape[0]
-        with suppress(UsageError):  # a failed drawing is no reason to end a flight
+        with suppress(UsageError):  # a failed drawing must not end a flight
             self._drone.annotate(frame, shapes, source=SOURCE)
 
     def _made(self, follower: Follower, action: AnyAction | None, *, caught_up: bool = True) -> TrackReport:
