@@ -367,9 +367,9 @@ test("one sentence says who has control, who waits, and what can be done", () =>
   assert.equal(says({ ...mine, waiting: ["cockpit 2"] }, [asks({ by: "cockpit 2" })]), "You have control, and cockpit 2 waits for it: hand it over, keep it, or fly on.");
   assert.equal(says({ ...mine, waiting: ["cockpit 2"] }, [asks({ by: "survey.py", declined: true })]), "You have control, and cockpit 2 and survey.py wait for it: fly, or release it.");
   const other: Partial<Authority> = { holder: "cockpit 2", priority: 8 };
-  assert.equal(says(other), "cockpit 2 has control, and nobody waits for it: ask for it, as your priority 8 is no higher.");
-  assert.equal(says({ ...other, waiting: ["cockpit 3"] }, [], { asks: false, priority: 4 }), "cockpit 2 has control, and cockpit 3 waits for it: you can take it at once, as your priority 4 is higher.");
-  assert.equal(says(other, [], { asks: true, priority: 8 }), "cockpit 2 has control, and nobody waits for it: ask for it, as your priority 8 is no higher.");
+  assert.equal(says(other), "cockpit 2 has control, and nobody waits for it: ask for it, since your priority 8 is no higher.");
+  assert.equal(says({ ...other, waiting: ["cockpit 3"] }, [], { asks: false, priority: 4 }), "cockpit 2 has control, and cockpit 3 waits for it: you can take it at once, since your priority 4 is higher.");
+  assert.equal(says(other, [], { asks: true, priority: 8 }), "cockpit 2 has control, and nobody waits for it: ask for it, since your priority 8 is no higher.");
   assert.equal(says(other, [], { asks: true, priority: 4 }), "cockpit 2 has control, and nobody waits for it: ask for it, and it may be handed over.");
   const line = { position: 1, wait_s: null, asked: true, declined: null };
   assert.equal(says({ ...other, state: "queued", waiting: ["cockpit 1"], line }), "cockpit 2 has control, and you wait for it: it is yours when it is released and you are first.");

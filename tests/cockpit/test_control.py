@@ -315,7 +315,7 @@ def test_a_flight_stays_watched_after_a_command_that_replaced_nothing(client: Te
         until(lambda: node.flyer.state is FlightState.FLYING)
         with pilot.staying():
             pilot.say("route_skip")
-            assert "no route" in pilot.wait("refused", do="route_skip")["why"]
+            assert "not flying a route" in pilot.wait("refused", do="route_skip")["why"]
             pilot.say("set", name="safety.box.x_high", value=20.0)
             assert "outside the safety box" in pilot.wait("refused", do="goto")["why"]
         until(lambda: node.flyer.state is FlightState.HOVERING)

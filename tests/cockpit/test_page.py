@@ -148,7 +148,7 @@ def test_who_is_no_higher_asks_with_the_same_press_and_hears_when_it_has_control
     page = deck.page("busy")
     first = page.pane.get_by_role("button", name="Ask first")
     with skyloop.connect("busy", name="first.py", authority=skyloop.Authority(priority=2)) as drone:
-        page.wait_for_text(".now", "ask for it, as your priority 8 is no higher")
+        page.wait_for_text(".now", "ask for it, since your priority 8 is no higher")
         assert not first.is_visible(), "there is no choice"
         page.press_until("c", lambda: "first.py was asked" in page.says(".waiting"), "it asks")
         page.pane.locator(".priority").fill("1")

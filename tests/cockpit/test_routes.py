@@ -168,7 +168,7 @@ def test_a_route_is_flown_paused_resumed_and_skipped(
         assert math.dist(node.flyer.place, (0.0, 0.3, 0.3)) < 0.2
         until(lambda: node.flyer.state is FlightState.HOVERING)
         pilot.say("route_resume")
-        assert "no route is flown" in pilot.wait("refused", do="route_resume")["why"]
+        assert "not flying a route" in pilot.wait("refused", do="route_resume")["why"]
 
 
 def test_a_page_that_falls_silent_or_commands_something_else_pauses_the_route(client: TestClient, node: Node) -> None:

@@ -26,7 +26,7 @@ FAILED: Final = 1
 USAGE_ERROR: Final = 2
 _WIDEST: Final = 80
 _NARROWEST: Final = 34
-_COLUMN: Final = 30  #: width of the column of options; longer options have their text on the next line
+_COLUMN: Final = 30  #: width of the options column; the text of longer options starts on the next line
 _NARROW_COLUMN: Final = 8
 _KINDS: Final = (
     (re.compile(r"<(?:float|int)(?: range)?>"), "N"),
@@ -70,7 +70,7 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 
 def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
-    """Return a command class that hands over to one of these if it is the first word: ``skyloop fly follow``."""
+    """Return a command class that runs one of ``entries`` if that is the first word, as in ``skyloop fly follow``."""
     others = {name: _alone(name, each) for name, each in entries.items()}
 
     class WithBehaviours(Command):
@@ -84,7 +84,7 @@ def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
 
 
 def _alone(name: str, entry: Entry) -> Any:
-    """Return one command as a command line of its own."""
+    """Return one command as a separate command line."""
     own = typer.Typer(add_completion=False, rich_markup_mode=None)
     function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
     own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
@@ -115,7 +115,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
-    except ImportError as error:  # an import that no module of Skyloop checks for
+    except ImportError as error:  # a missing package that no module of Skyloop checks for
         from skyloop.cli.install import missing
 
         entry = entry_of(arguments)
@@ -209,7 +209,7 @@ class Group(TyperGroup):
 class ByTask(Group):
     """All commands in the order of the table, each created on demand."""
 
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  Typer's signature
         """Return the names of the commands in the order used in help."""
         return list(COMMANDS)
 
@@ -262,7 +262,7 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write arguments as words only, and options with their values."""
+    """Write the arguments by name and the options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

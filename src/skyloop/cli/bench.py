@@ -28,9 +28,9 @@ _SMALL: Final = (320, 240)
 def bench(
     what: Annotated[
         What,
-        typer.Argument(help="delays: the channels, beside a bare hand-over of the same bytes; sim: the simulator"),
+        typer.Argument(help="delays: the channels, next to a bare hand-over of the same bytes; sim: the simulator"),
     ],
-    seconds: Annotated[float, typer.Option(min=LEAST_S, help="Duration; for delays, of each of the two")] = 30.0,
+    seconds: Annotated[float, typer.Option(min=LEAST_S, help="Duration; for delays, of each of the two runs")] = 30.0,
     sizes: Annotated[
         str | None, typer.Option(help="delays: frame sizes, such as 320x240,640x480 [default: 320x240]")
     ] = None,
@@ -73,7 +73,7 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
 
 
 def delay_table(results: DelayResults) -> Table:
-    """Return a table of the delays, next to those of the bare hand-over."""
+    """Return a table of the delays, with those of a bare hand-over for comparison."""
     rows = [
         (
             f"{row.channel} {row.size}" if row.channel == "video" else row.channel,

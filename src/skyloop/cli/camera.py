@@ -54,7 +54,7 @@ Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The markers of a 
 
 @camera.callback()
 def _camera() -> None:
-    """Print a board, calibrate a camera with pictures of it, and list this machine's cameras.
+    """Print a board, calibrate a camera with images of it, and list this machine's cameras.
 
     skyloop camera COMMAND --help describes each.
     """
@@ -68,7 +68,7 @@ def board(
     square_mm: SquareMm = 33.0,
     kind: KindOption = Kind.CHARUCO,
     dictionary: Dictionary = "4x4_50",
-    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a picture")] = 300,
+    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a .png")] = 300,
 ) -> None:
     """Write a calibration board; the default fits A4. Print it at 100 %, and glue it onto something flat."""
     made = _board(columns, rows, square_mm, kind, dictionary)
@@ -86,13 +86,13 @@ def calibrate(
         ),
     ] = None,
     drone: DroneOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write")] = Path("camera.json"),
     camera: Annotated[
         str | None, typer.Option(metavar="NAME", help="The vehicle's camera [default: the first]")
     ] = None,
     model: Annotated[Lens, typer.Option(help="Lens model; a fisheye sees more than about 100° across")] = Lens.PINHOLE,
     views: Annotated[int, typer.Option(min=6, max=200, help="Number of views to take from a vehicle or a video")] = 25,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="Longest search for them")] = 180.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="Maximum time to search for them")] = 180.0,
     columns: Columns = 7,
     rows: Rows = 5,
     square_mm: SquareMm = 33.0,
@@ -104,7 +104,7 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length, principal point and distortion, and write them to a JSON file.
 
-    Show the board near and far, in all corners of the picture, and tilted. Views that differ enough are taken
+    Show the board near and far, in all corners of the image, and tilted. Views that differ enough are taken
     automatically; press Ctrl-C to stop early.
     """
     from skyloop.vision.calibrating import BoardFinder
@@ -146,17 +146,17 @@ def list_cameras() -> None:
 
 
 class _Search:
-    """Searches pictures for the board, one after another."""
+    """Searches images for the board, one after another."""
 
     def __init__(self, finder: BoardFinder, most: int) -> None:
-        self.every = False  #: take every view, which is right for single pictures; in a stream, only differing ones are
+        self.every = False  #: whether to use every view, as for single images, or only different ones, as for a stream
         self.collector: Collector | None = None
         self.looked = 0
         self._finder = finder
         self._most = most
 
     def run(self, pictures: Iterable[Picture], found: Callable[[Any, BoardView], None] | None = None) -> None:
-        """Search until the pictures end, enough views are found, or Ctrl-C. :class:`UsageError` if sizes differ."""
+        """Search until the images end, enough views are found, or Ctrl-C. Raise ``UsageError`` if the sizes differ."""
         from skyloop.vision.calibrating import Collector
 
         try:
@@ -299,7 +299,7 @@ class _Vehicle:
             tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
-        """Show the board that was found in the cockpit."""
+        """Draw the detected board on the video in the cockpit."""
         from skyloop.messages import Points
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)

@@ -30,10 +30,10 @@ def cockpit(
     ] = None,
     host: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback this needs --pair, tokens or certificates"),
+        typer.Option(metavar="ADDRESS", help="Address; beyond loopback this needs --pair, tokens or certificates"),
     ] = "127.0.0.1",
     token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="People to admit: lines of ROLE TOKEN [NAME]")
+        Path | None, typer.Option(metavar="FILE", help="File of people to admit: lines of ROLE TOKEN [NAME]")
     ] = None,
     https: Annotated[
         bool,
@@ -45,7 +45,7 @@ def cockpit(
         Path | None,
         typer.Option(metavar="FILE", help="Admit clients with a certificate from this authority; its OU is the role"),
     ] = None,
-    role: Annotated[Role, typer.Option(help="Role of every client, without tokens or certificates")] = Role.PILOT,
+    role: Annotated[Role, typer.Option(help="Everyone's role if there are no tokens or certificates")] = Role.PILOT,
     pair: Annotated[
         bool, typer.Option("--pair", help="Admit, in --role, the first browser that opens each link or QR code shown")
     ] = False,

@@ -30,7 +30,7 @@ class Entry(NamedTuple):
     example: str
     extras: tuple[str, ...] = ()  # optional parts that it needs; an error names all missing ones
     settings: Mapping[str, Any] = {}
-    behaviours: Mapping[str, Entry] = {}  # commands that replace it if one of them is the first word
+    behaviours: Mapping[str, Entry] = {}  # commands that run instead if their name is the first word
 
     @property
     def module(self) -> str:
@@ -68,7 +68,7 @@ COMMANDS: Final = {
             "follow": Entry(
                 Task.FLY,
                 "fly:fly_follow",
-                "Follow the target in a box, or of a class",
+                "Follow the target in a box, or one of a class",
                 "fly follow --class person --seconds 60",
                 ("vision", "detect"),
             )
@@ -150,12 +150,12 @@ COMMANDS: Final = {
         "param:param",
         "List, show or write a vehicle's parameters",
         "param alpha limits.tilt 0.2",
-        settings={"ignore_unknown_options": True},  # a value may begin with a minus
+        settings={"ignore_unknown_options": True},  # a value may begin with a minus sign
     ),
     "camera": Entry(
         Task.SET_UP,
         "camera:camera",
-        "Print a board, and calibrate a camera by it",
+        "Print a board, and calibrate a camera with it",
         "camera calibrate alpha",
         ("vision",),
     ),

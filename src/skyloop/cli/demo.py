@@ -49,7 +49,7 @@ def demo(
         float | None, typer.Option(min=0.0, help="Duration of following [default: until Ctrl-C]")
     ] = None,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No page; exit code 1 if the marker was in view less than 90 %")
+        bool, typer.Option("--headless", help="No page; exit code 1 if the marker was in view for less than 90 %")
     ] = False,
     world: Annotated[str, typer.Option(help="Name or file of a world")] = "room",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the marker's walk, the noise and the wind")] = 0,
@@ -88,7 +88,7 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
-        """Fly the demonstration; ``port`` None: the default port for pages. Raise errors of connecting and take-off."""
+        """Fly the demonstration; ``port`` is None for the default. Errors during connecting and take-off are raised."""
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
@@ -126,7 +126,7 @@ class _Demo:
             follower.run(seconds=self.seconds, until=lambda: self._stopped)
 
     def _stop(self) -> None:
-        """End the flight properly on the first Ctrl-C. A second one interrupts Python as usual."""
+        """End the flight properly on the first Ctrl-C. A second Ctrl-C interrupts Python as usual."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
@@ -169,7 +169,7 @@ def drone_and_page(
     """Connect to a vehicle, wait for its first image, and show the page.
 
     ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port;
-    None: the default one. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
+    None for the default. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess
@@ -287,7 +287,7 @@ class DemoReport:
     """The results of a demonstration, and their table."""
 
     first_picture_s: float | None = None  #: measured from the start of the demo
-    frames: int = 0  #: number since the marker was first seen
+    frames: int = 0  #: number of frames since the marker was first seen
     share_in_view: float | None = None
     estimated: Spread | None = None
     true: Spread | None = None
@@ -340,7 +340,7 @@ def _spread_text(spread: Spread | None) -> str:
 
 
 def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
-    """Return a channel's row; none if the channel is unused."""
+    """Return a channel's row, or no row if the channel is unused."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

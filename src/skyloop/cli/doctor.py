@@ -48,13 +48,13 @@ PORTS: Final = (
     ("TCP", 7447, "routers"),
 )
 ANSWER_S: Final = 3.5  #: time for a vehicle to answer; chosen so that the user gets a result within 5 s
-PATIENCE_S: Final = 40.0  #: time for reading from a vehicle that answers
+PATIENCE_S: Final = 40.0  #: time limit for reading the settings of a vehicle that answers
 FEEDBACK_S: Final = 3.0
-SETTLE_S: Final = 2.0  #: time for faults to clear that our first messages end, such as a receiver without sticks
+SETTLE_S: Final = 2.0  #: time for faults to clear that our first messages fix, such as a missing stick input
 LOOK_S: Final = 0.1
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
 STATE_S = 2.0
-VIDEO_S = 5.0  #: for the first picture, which a vehicle just started, such as a Tello, sends after some seconds
+VIDEO_S = 5.0  #: time limit for the first image; a Tello that was just switched on takes some seconds
 
 
 class Health(StrEnum):
@@ -91,7 +91,7 @@ def doctor(
 ) -> None:
     """Check Python, the local transport, every optional part, cameras, ports, drivers and proxies; or one vehicle.
 
-    Marks: ✓ works, – optional and missing, or a vehicle's safety net is off, ✗ broken. The exit code is 1 if
+    Marks: ✓ works, – an optional part is missing or a vehicle's safety net is off, ✗ broken. The exit code is 1 if
     something is broken.
     """
     console = Console(soft_wrap=True)
@@ -107,7 +107,7 @@ def doctor(
 
 
 def examine() -> Iterator[Finding]:
-    """Yield all findings in reading order. A check that breaks is itself a finding."""
+    """Yield all findings in reading order. A check that fails is itself reported."""
     from skyloop.errors import MissingExtraError
 
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
@@ -127,7 +127,7 @@ def examine() -> Iterator[Finding]:
             yield from check()
         except MissingExtraError as error:
             yield Finding(what, Health.MISSING, str(error))
-        except Exception as error:  # noqa: BLE001  a doctor reports what is broken, also in the checks
+        except Exception as error:  # noqa: BLE001  a check that fails is itself reported
             yield Finding(what, Health.BAD, f"{type(error).__name__}: {error}")
 
 
@@ -237,7 +237,7 @@ def _browser() -> Iterator[Finding]:
         found = webbrowser.get()
     except webbrowser.Error:
         yield Finding(
-            "browser", Health.MISSING, "none is found here", "open the cockpit's address from another machine"
+            "browser", Health.MISSING, "none found on this machine", "open the cockpit's address from another machine"
         )
     else:
         yield Finding("browser", Health.GOOD, getattr(found, "name", type(found).__name__))
@@ -255,7 +255,7 @@ def _ports() -> Iterator[Finding]:
 def _free(kind: str, port: int) -> bool:
     """Return whether a program could listen on this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
-        if kind == "TCP":  # like servers, so that a recently closed port counts as free
+        if kind == "TCP":  # as servers do, so that a recently closed port counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", port))
@@ -357,7 +357,7 @@ def preflight(
 ) -> None:
     """Check a drone before a flight: link, battery, position, zones, video, its own failsafes. Flies nothing.
 
-    Marks: ✓ as it should be, ! it can fly without, ✗ it would not fly, or not safely. The exit code is 1 with any ✗.
+    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. The exit code is 1 with any ✗.
     """
     from contextlib import suppress
 

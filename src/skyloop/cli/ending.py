@@ -38,11 +38,11 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array o
 
 
 class Ending(msgspec.Struct, frozen=True):
-    """How ending one drone's flight turned out."""
+    """The result of ending one drone's flight."""
 
     name: str
     ok: bool
-    outcome: str  #: how the flight ended, or why it did not
+    outcome: str  #: how the flight ended, or why it did not end
 
 
 def land(
@@ -83,8 +83,8 @@ def return_to_start(
 
     Each drone climbs, flies straight to a point above its start and lands; nothing keeps several drones apart on the
     way. A drone flown by another application is reported and left alone, unless --priority is higher (a lower number).
-    Exit code 1 if a drone has not landed at its start: such a drone, and every drone after Ctrl-C, hovers, then lands 5
-    s later if nobody flies it.
+    Exit code 1 if a drone has not landed at its start. Such a drone, and every drone after Ctrl-C, hovers and lands 5
+    s later unless someone flies it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -113,7 +113,7 @@ def stop(
 ) -> None:
     """Emergency stop: cut the motors at once. The drones FALL.
 
-    This works no matter who flies, and asks first, except with --yes. Exit code 1 if a drone has not confirmed it.
+    It works no matter who is flying and asks first, except with --yes. Exit code 1 if a drone did not confirm.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:
@@ -156,7 +156,7 @@ def _each(
 ) -> None:
     """End all flights in parallel. Print a line for each as soon as it has ended, or everything as JSON.
 
-    ``interrupted`` is called on Ctrl-C; it must cause each ``end`` to return or raise.
+    ``interrupted`` is called on Ctrl-C and must make each call of ``end`` return or raise.
     """
 
     def attempt(name: str) -> Ending:
@@ -202,7 +202,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether its pilot lands it, such as another ``skyloop land`` with the same priority; wait for that."""
+    """Return whether its pilot is landing it, such as another ``skyloop land``; if so, wait until it has landed."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 
@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover, and start no more returns."""
+    """Hover permanently, so that no further return is attempted."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 

@@ -69,11 +69,11 @@ def fly(
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
-    With the word follow for FILE it follows a person, a car or the target in a box: skyloop fly follow --help.
+    If FILE is the word follow, it follows a person, a car or the target in a box: see skyloop fly follow --help.
 
     A line on standard error shows the progress; in a pipe, a new one every 5 seconds.
 
-    Ctrl-C lands too, as does an error in the controller without --reload.
+    Ctrl-C also lands the drone, as does an error in the controller without --reload.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -131,10 +131,10 @@ def run(
     Args:
         flight: The flight to run.
         drone: The drone, connected as a pilot.
-        seconds: The duration; None: until the controller ends, or Ctrl-C.
-        reloader: Reloads the controller's file; None: never reload.
+        seconds: The duration; if None, run until the controller ends or Ctrl-C is pressed.
+        reloader: Reloads the controller's file; if None, it is never reloaded.
         takeoff: Whether to take off from the ground.
-        progress: Shows the progress; None: the default display for flights.
+        progress: Shows the progress; if None, the default display for flights does.
 
     Returns:
         Whether the flight ended as intended. Errors during take-off are raised; those in the controller are shown.
@@ -218,7 +218,7 @@ class Flight:
                 self._report("the saved file is not used: the previous one keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
-        """Hover until a file that can be flown is saved; return False if the time ends or the drone is gone first."""
+        """Hover until a usable file is saved; return False if the time ends or the drone is gone first."""
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False
@@ -226,7 +226,7 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Replace the current controller with the loaded one, if possible. The old one can't command any more."""
+        """Replace the current controller with the loaded one, if possible. The old one can then no longer fly it."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:
@@ -252,7 +252,7 @@ class Flight:
 def what_failed(error: Exception) -> str:
     """Return what the user needs to fix an error: their own line, then the traceback without Skyloop's lines.
 
-    An error raised deliberately by Skyloop, with no line of the user's, becomes one line; any other is shown in full.
+    An error that Skyloop raised deliberately and outside the user's code becomes one line; others are shown in full.
     """
     home = str(Path(__file__).parents[1])
     trace = traceback.TracebackException.from_exception(error)
@@ -280,9 +280,9 @@ class FlightProgress:
 
     Args:
         drone: The drone.
-        live: Whether to update one line in place; None: only if standard error is a terminal.
+        live: Whether to update one line in place; if None, only if standard error is a terminal.
         what: Returns the state of the flight, shown at the beginning of the line.
-        every_s: Interval between lines if standard error is not a terminal; None: :data:`LINE_EVERY_S`.
+        every_s: Interval between lines if standard error is not a terminal; if None, :data:`LINE_EVERY_S`.
     """
 
     def __init__(
@@ -371,7 +371,7 @@ def fly_follow(
         str | None,
         typer.Argument(
             metavar="[NAME]",
-            help="A running proxy, or a vehicle's address; without: a simulated park",
+            help="A running proxy, or a vehicle's address [default: a simulated park]",
             autocompletion=naming.drone_names,
             show_default=False,
         ),
@@ -381,7 +381,7 @@ def fly_follow(
         str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
     ] = None,
     class_name: Annotated[
-        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person")
+        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest object of a class, e.g. person")
     ] = None,
     detector: Annotated[
         str | None,
@@ -408,7 +408,7 @@ def fly_follow(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Take off, follow a target by the camera, land. Without NAME a simulated drone follows a person in a park.
+    """Take off, follow a target with the camera, land. Without NAME a simulated drone follows a person in a park.
 
     Give --class, --box, or both. It does not see walls and trees: fly it where there are none.
 

@@ -42,7 +42,7 @@ def proxy(
     metrics: net.MetricsOption = None,
     parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
-    """Serve one vehicle to applications, until Ctrl-C, which lands it first.
+    """Serve one vehicle to applications until Ctrl-C is pressed, and land it before exiting.
 
     Serves applications on this host and, with --network, on others too.
     """
@@ -69,7 +69,7 @@ def proxy(
 
 
 def host(fleet: FleetArgument, group: GroupOption = None, metrics: net.MetricsOption = None) -> None:
-    """Serve all vehicles of a file from one process, until Ctrl-C, which lands them first.
+    """Serve all vehicles listed in a file from one process until Ctrl-C is pressed, and land them before exiting.
 
     skyloop host status, add and remove show and change its vehicles while it runs; each has its own --help.
     """
@@ -137,7 +137,7 @@ def remove(
 ) -> None:
     """Land a vehicle of a running host, and stop serving it.
 
-    Refused while the vehicle flies under an application's authority, unless --land is given.
+    This is refused while the vehicle flies under an application's authority, unless --land is given.
     """
     from skyloop.host.serve import Remove
 

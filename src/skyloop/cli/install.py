@@ -48,7 +48,7 @@ _EXTRA: Final = re.compile(r"\s*(?:\band\s+)?\bextra\s*==\s*[\"']([\w-]+)[\"']")
 
 def install(
     parts: Annotated[list[str], typer.Argument(metavar="PART...", help="Such as vision; all: nearly all of them")],
-    anew: Annotated[bool, typer.Option("--anew", help="Reinstall present packages too, to repair them")] = False,
+    anew: Annotated[bool, typer.Option("--anew", help="Reinstall existing packages too, to repair them")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be installed")] = False,
 ) -> None:
     """Install optional parts of Skyloop into the Python environment that runs this command.
@@ -118,6 +118,6 @@ def _is_there(module: str) -> bool:
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Extend an error that names one part to install, so that it names all missing ones of ``parts``."""
+    """Extend an error about one missing part, so that it names all those of ``parts`` that are missing."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

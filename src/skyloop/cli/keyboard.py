@@ -1,4 +1,4 @@
-"""Convert a terminal's keys to a pilot's sticks and orders; :class:`Hands` and :class:`Tokenizer` are pure.
+"""Convert a terminal's keys to a pilot's stick positions and commands; :class:`Hands` and :class:`Tokenizer` are pure.
 
 A terminal reports presses and repeats, but never releases. A press therefore moves its stick for :data:`HOLD_S`, which
 is longer than terminals wait before they repeat a key; repeats keep the stick there.
@@ -20,11 +20,11 @@ from skyloop.messages import FlightState
 
 HOLD_S: Final = 0.6  #: how long a press moves its stick
 TWICE_S: Final = 1.0  #: two presses of Esc within this time cut the motors
-REPEAT_S: Final = 0.12  #: a held key repeats faster than this; no finger does
+REPEAT_S: Final = 0.12  #: a held key repeats faster than this, and no finger can
 DELAY_S: Final = 0.2  #: no keyboard starts repeating sooner
 SAME_S: Final = 0.04  #: a second Esc this close to the keyboard's delay may be a repeat of the first
-LANDING_S: Final = 3.0  #: no stick moves for this long after L, because the vehicle may not show its landing yet
-STOPPING_S: Final = 2.0  #: nothing else is requested for this long after a stop, unless the vehicle already shows it
+LANDING_S: Final = 3.0  #: sticks are blocked for this long after L, because the vehicle may not report its landing yet
+STOPPING_S: Final = 2.0  #: nothing else is requested for this long after a stop, unless the vehicle already reports it
 _ESC_ALONE_S: Final = 0.03  #: the remaining bytes of an arrow key arrive within this time after its Esc
 _LONGEST: Final = 32  # maximum length of a sequence in bytes
 
@@ -103,7 +103,7 @@ class Deflection(NamedTuple):
 
 
 class Hands:
-    """Converts a pilot's keys to orders. Pure: the time [s] is an argument."""
+    """Converts a pilot's keys to commands. Pure; takes the time [s] as an argument."""
 
     def __init__(self) -> None:
         self._stepped_s = -math.inf  # time of the last step
@@ -116,12 +116,12 @@ class Hands:
         self._second: tuple[float, float] | None = None  # a second Esc: its time, and the time since the first
         self._repeats = False  # whether Esc is being held
         self._doubtful = False  # whether the last Esc may have been either a press or the first repeat of a held key
-        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; not known yet
-        self._newest = "", -math.inf, math.inf  # the last key, its time, and the time since the same key came before
-        self.no_effect = ""  #: why a key in the last step had no effect, for users; empty if all had
+        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; infinite until it is known
+        self._newest = "", -math.inf, math.inf  # the last key, its time, and the time since the same key's last press
+        self.no_effect = ""  #: why a key in the last step had no effect, for users; empty if all keys had one
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
-        """Return the orders in sequence. If a stick is moved, the positions of the sticks come last."""
+        """Return the commands in sequence. If a stick is moved, the positions of the sticks come last."""
         wanted: list[Order | Deflection] = []
         self.no_effect = ""
         stalled = now_s - self._stepped_s > REPEAT_S  # keys may have queued up, so their times are meaningless
@@ -158,14 +158,14 @@ class Hands:
     def _press(self, key: str, now_s: float, state: FlightState) -> Order | None:
         second, self._second, self._escaped_s = self._second, None, -math.inf
         if second is not None and second[1] < DELAY_S:
-            return self._stop(now_s)  # no held key repeats so early: it was pressed twice
+            return self._stop(now_s)  # too early for a repeat: the key was pressed twice
         key = key.lower()
         order = "hover" if key == "alt" else ORDERS.get(key)
         if order == "quit":
             return order
         if now_s - self._stopped_s < STOPPING_S and state is not FlightState.EMERGENCY:
             self.no_effect = f"{_shown(key)} has no effect while the motors are being stopped"
-            return None  # no order may replace a stop that the vehicle does not show yet
+            return None  # no command may replace a stop that the vehicle has not reported yet
         if key not in STICKS:
             if order is None:
                 self.no_effect = f"{_shown(key)} has no function here"
@@ -176,7 +176,7 @@ class Hands:
             self.no_effect = (
                 f"{_shown(key)} has no effect during a landing; release it, end the landing with H, and press it again"
             )
-            self._held_over[key] = now_s  # only H ends a landing: sticks don't, nor do keys held meanwhile
+            self._held_over[key] = now_s  # only H ends a landing, not sticks or keys held meanwhile
         else:
             self._pressed[axis] = (sign, now_s)
         return None
@@ -190,7 +190,7 @@ class Hands:
             first, self._second, self._repeats, self._doubtful = not self._repeats, None, True, False
             return "held" if first else None
         if self._doubtful and gap_s <= TWICE_S and not stalled:
-            return self._stop(now_s)  # no repeat comes so late: it is a new press, whatever the previous one was
+            return self._stop(now_s)  # too late for a repeat: a new press, whatever the last Esc was
         if gap_s > TWICE_S or self._repeats:
             self._repeats = self._doubtful = False
             return "hover"
@@ -218,13 +218,13 @@ def _shown(key: str) -> str:
 class Tokenizer:
     """Converts a terminal's bytes to keys: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
 
-    Alt sends an Esc before its key, and so does Esc pressed almost together with another key: ``alt`` hovers, and does
-    not count as Esc.
+    A terminal sends Alt with a key as Esc followed by that key, exactly like Esc pressed just before the key. Therefore
+    ``alt`` hovers, but does not count as Esc.
     """
 
     def __init__(self) -> None:
         self._rest = b""
-        self._alone = False  # whether an Esc was taken for a key of its own
+        self._alone = False  # whether the last Esc was treated as a separate key
         self.other = ""  #: a notice for users about other input in the last bytes; may be empty
 
     @property
@@ -233,8 +233,8 @@ class Tokenizer:
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[str]:
-        """Return the complete keys."""
-        late = self._alone and data[:1] in (b"[", b"O")  # the rest of an arrow key that arrived slowly
+        """Return the keys whose sequences are complete."""
+        late = self._alone and data[:1] in (b"[", b"O")  # the late remainder of an arrow key's sequence
         data, self._alone = self._rest + (b"\x1b" if late else b"") + data, False
         self.other = ""
         keys: list[str] = []
@@ -246,7 +246,7 @@ class Tokenizer:
                 arrow = _ARROW.fullmatch(found[0])
                 if (focus := _FOCUS.get(found[0][-3:])) is not None:
                     self.other = focus
-                    keys += ["esc"] * (len(found[0]) - 3)  # pressed just before, and not part of this sequence
+                    keys += ["esc"] * (len(found[0]) - 3)  # presses of Esc just before this sequence
                 elif arrow is not None and not late:
                     keys.append(_ARROWS[arrow[1]])
                 elif data[:2] == b"\x1b\x1b":
@@ -266,7 +266,7 @@ class Tokenizer:
         return keys
 
     def flush(self) -> list[str]:
-        """Return the keys of an unfinished sequence, because no more bytes arrived."""
+        """Return the keys of an unfinished sequence of which no more bytes have arrived."""
         rest, self._rest, self.other = self._rest, b"", ""
         self._alone = rest == b"\x1b"
         return ["esc"] * len(rest) if not rest.strip(b"\x1b") else ["alt"]
@@ -300,7 +300,7 @@ class Keyboard:
         self._set_mode()
         self._continued = signal.signal(
             signal.SIGCONT, lambda *_: self._set_mode()
-        )  # a shell has set its own mode in the meantime
+        )  # while suspended, a shell has set its own mode
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -308,7 +308,7 @@ class Keyboard:
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
 
     def _set_mode(self) -> None:
-        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S blocks nothing."""
+        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S has no effect."""
         termios = self._termios
         self._tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)
@@ -324,7 +324,7 @@ class Keyboard:
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
-        """Return the keys pressed, as soon as there are any. Raise ``EOFError`` if the terminal is gone."""
+        """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal is gone."""
         if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)

@@ -30,7 +30,7 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A proxy, as a row of ``list``."""
+    """A proxy as a row in the output of ``skyloop list``."""
 
     name: str
     transport: str = "local"  #: ``local``, ``fabric`` (the network) or both
@@ -72,7 +72,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return text saying that no proxy was found here or on the network searched, and whose proxies run here."""
+    """Return a message that no proxy was found here or on the network, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"

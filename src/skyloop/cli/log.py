@@ -68,7 +68,7 @@ def info(
     file: File,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems of the file."""
+    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems with the file."""
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)
@@ -106,7 +106,7 @@ def list_recordings(
         typer.echo(f"No recordings in {folder}. Make one: skyloop record alpha")
 
 
-@log.command(short_help="Make a page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
+@log.command(short_help="Create a page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
 def report(
     file: File,
     output: Annotated[
@@ -155,7 +155,7 @@ def export(
 
     H.264 is copied as recorded, which takes seconds, unless the time is drawn on the frames. For lerobot, flights
     become episodes of a LeRobotDataset: pictures, the state when each was captured, and the commands. rrd is a file for
-    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording itself.
+    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording directly.
     """
     from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4
@@ -208,17 +208,17 @@ def compare(
     old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording", autocompletion=recordings)],
     new: Annotated[
         Path,
-        typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first", autocompletion=recordings),
+        typer.Argument(metavar="NEW", help="Another, such as that of a replay of the first", autocompletion=recordings),
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them, as a .html page or .png image")
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Plot them in a .html page or .png image")
     ] = None,
     drone: DroneName = None,
     what: Annotated[Which, typer.Option(help="Commands as requested, or as applied")] = Which.ASKED,
     part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Compare a changed controller's commands to the old one's: RMS of each set-point, and where they diverge."""
+    """Compare the commands of an old and a changed controller: RMS of each set-point, and where they diverge."""
     from skyloop.recording.review.compare import compare as commands_of
 
     if output is not None and output.suffix not in (".html", ".png"):
@@ -243,7 +243,7 @@ def compare(
 def recover(
     file: File,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="NEW", help="[default: FILE-recovered.mcap beside it]")
+        Path | None, typer.Option("-o", "--output", metavar="NEW", help="[default: FILE-recovered.mcap next to it]")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""How command lines name drones and the network, with the same words, help and completion in every command.
+"""Options that name drones and the network, with the same words, help and completion in every command.
 
 A drone is given as NAME; ``--drone NAME`` means the same everywhere. The network is given as ``--network WHERE``.
 """
@@ -44,7 +44,7 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def network_places(incomplete: str) -> list[str]:
-    """Return the network place that is not an address."""
+    """Return ``multicast``, the only network place that is not an address."""
     return [place for place in ("multicast",) if place.startswith(incomplete)]
 
 
@@ -109,7 +109,7 @@ PriorityOption = Annotated[
     int, typer.Option("--priority", metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")
 ]
 WaitOption = Annotated[
-    float, typer.Option("--wait", metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+    float, typer.Option("--wait", metavar="S", min=0.0, help="Maximum wait in the queue for the authority")
 ]
 SecondsOption = Annotated[
     float | None, typer.Option("--seconds", metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
@@ -126,8 +126,8 @@ def keys_directory() -> Path:
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
     """Return the drone that a command is for.
 
-    ``default``: used if neither is given; None: a name is required. Raise ``UsageError`` if no drone is given, or two
-    are.
+    ``default``: used if neither is given; if None, a name is required. Raise ``UsageError`` unless exactly one drone is
+    given.
     """
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
@@ -169,7 +169,7 @@ def join_network(network: str | None, keys: Path | None) -> None:
 
 
 def with_place(arguments: Sequence[str]) -> list[str]:
-    """Insert ``multicast`` after a ``--network`` that has no place; return the words."""
+    """Return the arguments with ``multicast`` inserted after any ``--network`` without a place."""
     words: list[str] = []
     for index, word in enumerate(arguments):
         words.append(word)

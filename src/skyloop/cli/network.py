@@ -91,7 +91,7 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return the settings of a network given as in ``--network``.
+    """Return the settings of a network given as the value of ``--network`` and the related options.
 
     Raise ``UsageError`` if an address or the folder is invalid, or no place is given.
     """
@@ -194,9 +194,7 @@ def router(
         typer.echo(config.to_json(config.make(chosen, Part.ROUTER)))
         return
     if chosen.tls is None:
-        typer.echo(
-            "WARNING: a router without keys: anyone who reaches it can watch and fly the drones behind it", err=True
-        )
+        typer.echo("WARNING: a router without keys: anyone who can reach it can watch and fly its drones", err=True)
     ended = threading.Event()
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -246,7 +244,7 @@ def init(
     directory: LabOption = None,
     days: Annotated[int, typer.Option(metavar="N", help="Validity of the authority, and so of the lab")] = 1825,
 ) -> None:
-    """Create a lab's certificate authority. Its folder can make any key: keep it on one machine, with a backup."""
+    """Create a lab's certificate authority. Its folder lets anyone issue keys: keep it on one machine, backed up."""
     from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)
@@ -278,7 +276,7 @@ def issue(
     _print_roster(lab.directory, [each for each in lab.roster.entries if each.name != name])
 
 
-@keys.command(short_help="Show who has keys, until when", epilog=f"{_EXAMPLE}show")
+@keys.command(short_help="Show who has keys, and until when", epilog=f"{_EXAMPLE}show")
 def show(
     directory: LabOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,

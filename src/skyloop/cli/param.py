@@ -46,7 +46,7 @@ def param(
     keys: naming.KeysOption = None,
 ) -> None:
     """List a vehicle's parameters, show one, or write one."""
-    if drone is not None:  # in this case, the words that remain are KEY and VALUE
+    if drone is not None:  # the remaining words are then KEY and VALUE
         if value is not None and name != drone:
             raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
         if name != drone:
@@ -85,7 +85,7 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 def parse_value(parameter: Parameter, text: str) -> Value:
     """Parse a value typed by a person according to the parameter's type.
 
-    Raise ``UsageError`` if the value has another type.
+    Raise ``UsageError`` if the value has the wrong type.
     """
     try:
         match parameter.type:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
 _MOST_WORKERS: Final = 64
-MOST: Final = 64  #: most detections published per frame, the most certain: a result is limited to 32 768 bytes
+MOST: Final = 64  #: only the most certain detections are published, because a result is limited to 32 768 bytes
 
 
 def process(
@@ -43,7 +43,7 @@ def process(
         str | None, typer.Option(metavar="NAME", help="Name of the processor [default: the class's, in lower case]")
     ] = None,
     share: Annotated[
-        bool, typer.Option("--share/--all", help="Each frame to one worker of this name, or to all")
+        bool, typer.Option("--share/--all", help="Send each frame to one worker of this name, or to all")
     ] = True,
     workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes to run here")] = 1,
     max_age: Annotated[float, typer.Option(metavar="S", min=0.0, help="Skip frames older than this")] = 1.0,
@@ -51,7 +51,7 @@ def process(
         float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second of a worker")
     ] = None,
     stuck: Annotated[
-        float, typer.Option(metavar="S", min=0.05, help="After this long on one frame, its share goes to others")
+        float, typer.Option(metavar="S", min=0.05, help="Time on one frame after which others get a worker's frames")
     ] = 2.0,
     seconds: naming.SecondsOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
@@ -78,7 +78,7 @@ def process(
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
-        pass  # the normal way to end
+        pass  # the normal way to stop
 
 
 def work(
@@ -172,7 +172,7 @@ def detect(
         str | None,
         typer.Argument(
             metavar="[FILE]",
-            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, for the simulator's figures",
+            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; default: Skyloop's own, for the simulator's figures",
             show_default=False,
         ),
     ] = None,
@@ -219,7 +219,7 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # the normal way to end
+    with contextlib.suppress(KeyboardInterrupt):  # the normal way to stop
         work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
@@ -230,7 +230,7 @@ class DetectionProcessor:
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
-        """Set the detector, called on the worker's thread, and the names of the classes to publish; empty: all."""
+        """Set the detector, called on the worker's thread, and the names of the classes to publish, or none for all."""
         self._detector = detector
         self._classes = frozenset(classes)
 

@@ -46,7 +46,7 @@ def record(
             metavar="auto|jpeg|png", help="Encoding of frames; auto keeps H.264 unchanged, else jpeg; png is lossless"
         ),
     ] = "auto",
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Quality of JPEG")] = 90,
     rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="Maximum size of a file")] = None,
     rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="Maximum time of a file")] = None,
     min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Disk space to leave free")] = 256.0,
@@ -56,7 +56,7 @@ def record(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Record drones to an MCAP file until Ctrl-C. Only observes: any application may fly meanwhile.
+    """Record drones to an MCAP file until Ctrl-C. This only observes: others may fly meanwhile.
 
     If the output is not a terminal, a line is printed each second.
     """
@@ -77,7 +77,7 @@ def record(
         in_process=True,
     )
     interrupt_by_signals((signal.SIGTERM,))
-    with recorder, suppress(KeyboardInterrupt):  # the normal way to end
+    with recorder, suppress(KeyboardInterrupt):  # the normal way to stop
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
 
@@ -102,7 +102,7 @@ def _show(recorder: Recorder, seconds: float) -> None:
 
 
 def progress(status: Status, before: Status) -> str:
-    """Return the progress in one line; rates are measured since ``before``."""
+    """Return the progress in one line; rates are relative to ``before``."""
     span_s = max(1e-3, status.seconds - before.seconds)
     minutes, seconds = divmod(round(status.seconds), 60)
     parts = [
@@ -140,7 +140,7 @@ def view(
     rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback, anyone who reaches it sees the drones"),
+        typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones"),
     ] = "127.0.0.1",
     port: Annotated[
         int | None,
@@ -162,7 +162,7 @@ def view(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones live in Foxglove or Rerun until Ctrl-C. Only observes: any application may fly meanwhile.
+    """Show drones live in Foxglove or Rerun until Ctrl-C. This only observes: others may fly meanwhile.
 
     Connect Foxglove to the address shown. A slow or stalled viewer does not slow down anything else.
     """
@@ -170,7 +170,7 @@ def view(
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to end
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to stop
         from skyloop.client import connect as connect_to
         from skyloop.recording.taps import View, give_way
 
@@ -192,7 +192,7 @@ def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int
     typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")
     if not is_loopback(host):
         typer.echo(
-            f"WARNING: anyone who reaches {host} sees the drones: Foxglove's protocol has no passwords", err=True
+            f"WARNING: anyone who can reach {host} sees the drones: Foxglove's protocol has no passwords", err=True
         )
     return server
 

@@ -20,11 +20,11 @@ def ros(
             metavar="P",
             min=0,
             max=31,
-            help="Request the authority at once, 0 is the highest; without: use the service authority/request",
+            help="Priority for requesting the authority at once [default: by the service authority/request]",
         ),
     ] = None,
     cmd_vel_timeout: Annotated[
-        float, typer.Option(metavar="S", min=0.05, max=5.0, help="Silence on cmd_vel after which the drone hovers")
+        float, typer.Option(metavar="S", min=0.05, max=5.0, help="Time without cmd_vel after which the drone hovers")
     ] = 0.5,
     map_frame: Annotated[
         str, typer.Option("--map", metavar="FRAME", help="Join the drones' odom frames, if they share their axes")
@@ -35,7 +35,7 @@ def ros(
     ] = None,
     subnet: Annotated[
         bool,
-        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in reach may fly"),
+        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in range can fly"),
     ] = False,
     ros_args: Annotated[
         str, typer.Option(metavar="ARGS", help='For ROS 2, in quotes: --ros-args "-r cmd_vel:=teleop"')
@@ -45,8 +45,8 @@ def ros(
 ) -> None:
     """Show drones to ROS 2: images, state and transforms as topics; fly by cmd_vel and services. Until Ctrl-C.
 
-    Each drone is a namespace, such as /alpha. Only this machine finds it, unless --subnet or the ROS 2 variables say
-    otherwise. Drones flown by this command land when it ends.
+    Each drone is a namespace, such as /alpha. It is visible only on this machine, unless --subnet or the ROS 2
+    variables say otherwise. Drones flown by this command land when it ends.
     """
     from skyloop.ros import Bridge, Settings
     from skyloop.vehicles.ros2.node import domain_of
@@ -69,4 +69,4 @@ def ros(
                 typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
             bridge.run()
     except KeyboardInterrupt:
-        pass  # the normal way to end
+        pass  # the normal way to stop

@@ -58,7 +58,7 @@ def fly(
     wait: WaitOption = 0.0,
     land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
 ) -> None:
-    """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
+    """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal, P pauses, R resumes and S skips."""
     from skyloop.cli import interrupt_by_signals
     from skyloop.cli.fly import ADVICE
     from skyloop.cli.fly import land as put_down
@@ -107,7 +107,7 @@ def _run(flight: FlyRoute) -> None:
             for key in pressed(0.0) if pressed is not None else ():
                 if key.lower() in acts:
                     acts[key.lower()]()
-            return pressed is None and flight.law.state == "paused"  # no keyboard could resume the route
+            return pressed is None and flight.law.state == "paused"  # without a keyboard, the route can't be resumed
 
         flight.run(until=look)
     if flight.law.state == "paused":

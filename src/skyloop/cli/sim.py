@@ -50,7 +50,7 @@ def sim(
     world: Annotated[str, typer.Option(metavar="WORLD", help="Name or file of the world")] = "room",
     seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed of wind, noise and targets")] = 0,
     speed: Annotated[float, typer.Option(metavar="X", min=0.01, max=100.0, help="Simulated seconds per second")] = 1.0,
-    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy; several are numbered: sim1, sim2, …")] = NAME,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy name; several are numbered: sim1, sim2, …")] = NAME,
     option: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; repeatable"),
@@ -81,23 +81,21 @@ def sim(
     ] = None,
     port_base: Annotated[
         int | None,
-        typer.Option(
-            metavar="P", min=0, max=65000, help="Firmware: count its ports from here, not the usual; 0: any free"
-        ),
+        typer.Option(metavar="P", min=0, max=65000, help="Firmware: first port, instead of the usual one; 0: any free"),
     ] = None,
     lose: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams lost, each way")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams lost, each way")
     ] = None,
     delay: Annotated[
         float | None,
         typer.Option(metavar="S", min=0, max=MOST_DELAY_S, help="Firmware: delay of datagrams, each way [s]"),
     ] = None,
     repeat: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams duplicated")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams duplicated")
     ] = None,
     reorder: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams swapped with the next"),
+        typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: fraction of datagrams swapped with the next"),
     ] = None,
     video_port: Annotated[
         int | None,
@@ -175,7 +173,7 @@ def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
         raise UsageError(
             "these --autopilot fly different vehicles by default: choose one, such as --option vehicle=iris"
         )
-    return min(each, key=lambda options: options.most_lag_s)  # the strictest about the computer's time decides
+    return min(each, key=lambda options: options.most_lag_s)  # the strictest limit on the computer's lag applies
 
 
 def _serve_proxies(
@@ -233,10 +231,10 @@ class Serving:
     """The addresses of the emulated drones, and the faults applied to their datagrams."""
 
     bind: str
-    port_base: int | None  #: None: the usual ports
+    port_base: int | None  #: first port; None for the usual ones
     faults: Faults
     delay_s: float
-    video_port: int | None = None  #: for autopilots: port to which images are sent; None: none
+    video_port: int | None = None  #: for autopilots: port to which video is sent; None for no video
 
 
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
@@ -339,7 +337,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 def address_from(base: str, drone: int) -> str:
     """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
 
-    Raise ``UsageError`` if the first address is not IPv4, or there is no next address.
+    Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
     """
     if drone == 0:
         return base
@@ -350,7 +348,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone: the first one's start at ``base`` (0: any free ones), each next one's 10 higher.
+    """Return an AR.Drone's ports, starting at ``base`` and 10 higher for each further drone; any free ones if it is 0.
 
     Raise ``UsageError`` if a port is out of range.
     """

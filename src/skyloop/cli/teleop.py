@@ -93,9 +93,9 @@ class Teleop:
                 self._message = self._hands.no_effect or keyboard.other or self._message
 
     def obey(self, order: Order | Deflection) -> None:
-        """Carry out an order. If it is impossible, report that and change nothing.
+        """Carry out a command. If that is impossible, report it and change nothing.
 
-        Only taking control waits for an answer, on a separate thread: meanwhile, an emergency stop still works.
+        Only taking control waits for an answer. It does so on a separate thread, so that an emergency stop still works.
         """
         if order != "take":
             self._carry_out(order)
@@ -135,7 +135,7 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # the take-off may not show yet
+            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # it may lag a take-off
                 return self._obey("grounded")
             drone.hover()
         elif order == "take":
@@ -165,7 +165,7 @@ class Teleop:
         return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
-        """Return the whole display, most important first: whatever does not fit is cut off at the bottom."""
+        """Return the whole display, most important first; the end is cut off if it does not fit."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone

@@ -1,4 +1,4 @@
-"""Text for terminals and pipes, and errors in terms of the command line: the problem, and the words to type."""
+"""Format text for terminals and pipes, and explain errors in terms of the command line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PLAIN: Final = {
 }
 _RED: Final = 31
 _YELLOW: Final = 33
-#: Beginnings of lines, and their colours.
+#: Colours of lines, by the words that they begin with.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 
@@ -63,17 +63,17 @@ def print_json(value: Any) -> None:
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON; what JSON has no form for, such as a path, becomes text."""
+    """Return a value as JSON; a value without an equivalent in JSON, such as a path, becomes text."""
     import msgspec
 
     return msgspec.json.encode(value, enc_hook=str).decode()
 
 
 def coloured(line: str, stream: TextIO | None) -> str:
-    """Return a line with its beginning coloured, if that has a meaning and the stream shows colours.
+    """Return a line with its beginning coloured, if it has a known meaning and the stream shows colours.
 
     A stream shows colours if it is a terminal, not a dumb one, and ``NO_COLOR`` is not set (https://no-color.org).
-    ``stream``: where the line is printed. None, Python's value for a stream closed before the start: nowhere.
+    ``stream``: where the line is printed; None if that was closed before Python started.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line

@@ -63,7 +63,7 @@ def watch(
             else:
                 _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
-            pass  # the normal way to end
+            pass  # the normal way to stop
 
 
 def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
@@ -72,7 +72,7 @@ def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event
     end = due + duration_s
 
     def show(one: Event) -> None:
-        with suppress(BrokenPipeError):  # the reader is gone, as the next line will also notice
+        with suppress(BrokenPipeError):  # the reader is gone; printing the next line will raise the same error
             typer.echo(event(one))
 
     with drone.on_event(show):

@@ -39,14 +39,14 @@ PAIRING_S: Final = 3600.0  #: lifetime of a pairing code
 MAX_SESSIONS: Final = 1000
 SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
 MAX_TOKEN: Final = 256
-CERTIFICATE: Final = "peer_certificate"  #: key of the client's certificate in the connection's state
+CERTIFICATE: Final = "peer_certificate"  #: key under which a connection's state holds the client's certificate
 
 FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubles with each further one
 LONGEST_S: Final = 16.0  #: must be less than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
 FORGET_S: Final = 600.0  #: an address starts over if it sends no wrong token for this long
 MAX_ADDRESSES: Final = 1024  #: addresses remembered at once; the one that has been quiet for longest is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens per minute, from all addresses together, before the delay below is added
-EACH_IN_ALL_S: Final = 0.1  #: delay added by each further one per minute, from any address
+EACH_IN_ALL_S: Final = 0.1  #: delay added by each wrong token beyond those, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
@@ -57,7 +57,7 @@ _LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of these tables
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
 
-MAX_NAME: Final = 40  #: maximum length of a name that a person asks for
+MAX_NAME: Final = 40  #: maximum length of a name chosen by a person
 _log = logging.getLogger(__name__)
 
 
@@ -102,7 +102,7 @@ def _table_entry(end: Endpoint, mapped: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """The sender of a request, as far as known; ``name`` may be empty."""
+    """The sender of a request; ``name`` is empty if unknown."""
 
     role: Role
     name: str = ""
@@ -112,7 +112,7 @@ class Person:
         return self.role is Role.PILOT or role is Role.OBSERVER
 
     def display_name(self, requested: str) -> str:
-        """Return the name shown to others; ``requested`` is used only for people without a name of their own."""
+        """Return the name shown to others; ``requested`` is used only if the person's token or certificate has none."""
         return self.name or " ".join("".join(filter(str.isprintable, requested)).split())[:MAX_NAME]
 
 
@@ -164,7 +164,7 @@ class Pairing:
     """
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
-        self.on_used: Callable[[str], None] = lambda _: None  #: called with address and role after a code was used
+        self.on_used: Callable[[str], None] = lambda _: None  #: called with address and role once a code has been used
         self.on_expired: Callable[[], None] = lambda: None  #: called once a code has expired
         self.role = role
         self._clock = clock
@@ -184,7 +184,7 @@ class Pairing:
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return who sent a code and use the code up; None if it is not the current one."""
+        """Return the person who sent a code, and use the code up; None if it is not the current one."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
@@ -238,7 +238,7 @@ class TokenGate:
         return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
-        """Return the owner of a token, None if it is unknown. A nearly right token takes as long as any other."""
+        """Return the owner of a token, or None if it is unknown, in a time that reveals nothing about known tokens."""
         given = token.encode()[: MAX_TOKEN + 1]
         found = None
         for one in self._tokens:
@@ -247,7 +247,7 @@ class TokenGate:
         return found
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
-        """Return who logs in with a token or a pairing code, which is used up; None if it is neither."""
+        """Return the person who has this token or pairing code, and use a code up; None if it is neither."""
         found = self.known(token)
         if found is None and self.pairing is not None:
             found = self.pairing.person(token, _address(scope))
@@ -299,8 +299,8 @@ class CertificateGate:
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
     """Return the role and name in a certificate.
 
-    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None if no OU is a
-    role, or several are.
+    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None unless
+    exactly one OU is a role.
     """
     if not certificate:
         return None
@@ -389,7 +389,7 @@ class WrongTokens:
     def __init__(self, clock: Clock = monotonic_ns) -> None:
         self.count = 0  #: number of wrong tokens since the start
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # number, and time of the last one; quietest address first
+        self._of_address: dict[str, tuple[int, int]] = {}  # wrong tokens and time of the last; quietest first
         self._minute_ns = clock()
         self._in_minute = 0
 
@@ -437,7 +437,7 @@ class SessionFile:
     """Stores the sessions of one cockpit, so that after a restart a page reconnects without logging in again.
 
     Only this user may read the file, next to the proxies' sockets. It contains hashes of cookies and tokens, which
-    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates it.
+    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:

@@ -30,8 +30,8 @@ def bind(address: str, port: int | None) -> socket.socket:
 
     Args:
         address: The address.
-        port: The TCP port. 0: any free one; None: :data:`DEFAULT_PORT` or, if that is taken, the next free one, with a
-            line on standard error that names the program using the default.
+        port: The TCP port; 0 selects a free one. If None, use :data:`DEFAULT_PORT` or, if that is taken, the next free
+            one, and name the program that uses the default on standard error.
 
     Raises:
         UsageError: The port is taken or unusable.

@@ -1,4 +1,4 @@
-"""Determine a drone's alarms: pure decisions from links, feedback and ages.
+"""Determine a drone's alarms from its links, feedback and ages, without side effects.
 
 The thresholds are parameters of the drone's proxy, so they are the same on every page.
 """
@@ -36,7 +36,7 @@ class Alarm(msgspec.Struct, frozen=True):
     """A problem that currently exists.
 
     Args:
-        id: Its subject, constant while the alarm lasts: lets a page remember that a person acknowledged it.
+        id: The alarm's subject. It stays the same while the alarm lasts, so a page can remember acknowledgements.
         severity: May rise while the alarm lasts, for example when a degraded link is lost.
         text: A description that includes the current value.
     """
@@ -110,7 +110,7 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
         returns = feedback.return_phase in (ReturnPhase.CLIMBING, ReturnPhase.FLYING)
         yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'}")
     elif feedback.failsafe is not Failsafe.NONE:
-        end = "" if feedback.lease else ", returning or landing next unless someone takes control"  # no lease: no pilot
+        end = "" if feedback.lease else ", returning or landing next unless someone takes control"  # no lease, no pilot
         yield _warning("failsafe", f"failsafe: hovering{end}")
     charge = feedback.battery
     if charge is not None and charge < thresholds.battery_critical:
@@ -159,7 +159,7 @@ PARAMETERS: Final = {
 
 
 class ThresholdReader:
-    """Reads the thresholds, and reads them again after a parameter was written or a link was restored.
+    """Reads the thresholds, and reads them again after a parameter has been written or a link restored.
 
     Created and used on the event loop.
     """

@@ -40,7 +40,7 @@ _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
-    (ClosedError, 404),  # a replay that has ended in the meantime
+    (ClosedError, 404),  # a replay that has just ended
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),
@@ -103,7 +103,7 @@ def answer_json(values: Any, status: int = 200) -> Response:
 
 
 def check_json(request: Request) -> None:
-    """Check the content type. Browsers must ask before sending this one on behalf of another site, and are refused."""
+    """Check the content type; browsers let pages of other sites send this one only with the server's permission."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
         raise BadRequest(415, f"the content type must be {_JSON}")
 

@@ -8,7 +8,7 @@
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, in JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
-``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, who has control
+``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, the pilot
 ======================================  ==================================================================
 """
 
@@ -56,7 +56,7 @@ from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
-SMALLEST_PACKED: Final = 1000  #: bytes; compressing less than this gains nothing
+SMALLEST_PACKED: Final = 1000  #: minimum size of an answer worth compressing [bytes]
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
@@ -141,7 +141,7 @@ def _read(full: str, stamp: tuple[int, int]) -> _File:
 
 
 STATIC = Path(__file__).with_name("static")
-_THREADS: Final = 32  # for blocking work: proxies that answer late, recorders that take time to end
+_THREADS: Final = 32  # number of threads for blocking work, such as waiting for proxies and recorders
 
 
 class Cockpit:

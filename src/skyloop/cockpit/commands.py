@@ -1,4 +1,4 @@
-"""Commands from a page: one JSON object per message, with the command's kind in ``do``; and their timeliness."""
+"""Decode a page's commands, one JSON object per message with its kind in ``do``, and check that they are recent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
 LATE_S: Final = 0.5  #: a command that may be older is refused, because its sender no longer expects it to be obeyed
-#: An emergency stop may be this late, which is how long the page shows it as pending.
+#: Maximum age of an emergency stop; the page shows the stop as pending for this long.
 STOP_LATE_S: Final = 2.0
 #: If pushed sticks have not moved for this long, nobody is assumed to hold them. Bluetooth can take up to 20 s to
 #: report a lost gamepad.
@@ -31,7 +31,7 @@ class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields
     #: When the person requested it, on the cockpit's clock as the page estimates it from pongs [s].
     at_s: float | None = None
     unsure_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  #: uncertainty of ``at_s`` [s]
-    n: int = 0  #: number that answers repeat
+    n: int = 0  #: number chosen by the page and repeated in the answers
 
     @property
     def do(self) -> str:
@@ -62,7 +62,7 @@ class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover as a person requested; or automatically, because no key or stick is held, without taking it from others."""
+    """Hover at a person's request or, if ``automatic``, because no input is held; the latter never takes control."""
 
     automatic: bool = False
 
@@ -85,7 +85,7 @@ class Fly(Command, frozen=True, tag="fly"):
     left: float = 0.0
     up: float = 0.0
     yaw_rate: float = 0.0
-    #: Increases with each sign of a hand: moving fingers, repeating keys, raw axes. None if it is not reported.
+    #: Counter of signs of a hand: moving fingers, repeating keys, raw axes. None if the page does not report it.
     touches: int | None = None
 
 
@@ -125,7 +125,7 @@ class StopRoute(Command, frozen=True, tag="route_stop"):
 
 
 class SelectTarget(Command, frozen=True, tag="follow_select"):
-    """Keep a camera's frames while a person draws a box on one of them; None: stop keeping them."""
+    """Keep a camera's frames while a person draws a box on one of them; if None, stop."""
 
     camera: CameraName | None
 
@@ -136,17 +136,17 @@ class FollowTarget(Command, frozen=True, tag="follow"):
     camera: CameraName
     captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: capture time of the frame under the box [ns]
     box: tuple[float, float, float, float]  #: x and y of its upper left corner, width and height [pixels]
-    mode: Word | None = None  #: None: only track until a mode is set
+    mode: Word | None = None  #: if None, only track until a mode is set
     class_name: Word | None = None  #: class of a selected detection
-    distance_m: float | None = None  #: distance to keep; None: the follower's default
-    size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None: the frame's size
+    distance_m: float | None = None  #: distance to keep; None for the follower's default
+    size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None for the frame's size
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
-    """Follow the tracked target, or change the mode of following."""
+    """Follow the tracked target, or change the following mode."""
 
     mode: Word
-    distance_m: float | None = None  #: distance to keep; None: unchanged
+    distance_m: float | None = None  #: distance to keep; None for no change
 
 
 class StopFollowing(Command, frozen=True, tag="follow_stop"):
@@ -223,7 +223,7 @@ def late_s(command: Command) -> float:
 
 
 class HandWatch:
-    """Determines whether a hand holds the pushed sticks. Pure.
+    """Determines whether a hand is holding the pushed sticks. Pure.
 
     Hands are never still: a finger moves by pixels, a held key repeats, an axis at its limit jitters. The values from a
     gamepad that has lost its radio link stay constant, as do those of a page that has lost track of held keys.
@@ -235,7 +235,7 @@ class HandWatch:
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Return whether the sticks showed a hand within :data:`UNTOUCHED_S`; to be called for each stick command."""
+        """Handle a stick command; return whether there has been a sign of a hand within :data:`UNTOUCHED_S`."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
@@ -246,7 +246,7 @@ class HandWatch:
 
 
 def untimely(command: Command, now_s: float) -> str:
-    """Return the reason to refuse a command because of its age; empty if it is in time.
+    """Return why a command is refused because of its age; empty if it is recent enough.
 
     A command whose age is unknown is refused, and one that might be too old is treated as too old.
     """

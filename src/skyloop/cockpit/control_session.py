@@ -1,7 +1,7 @@
 """One page's control of one drone: convert the page's messages to commands for the vehicle, and answer them.
 
 A command that arrives in time (:func:`skyloop.cockpit.commands.untimely`) is carried out; any other is refused and
-never carried out later. Only the hover sent for released sticks is carried out whatever its age.
+never carried out later. The only exception is the hover sent for released sticks, which may be of any age.
 
 The page has a dead-man switch: if it flies with sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
 vehicle hovers. A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated as a
@@ -44,7 +44,7 @@ SILENT_S: Final = 0.5  #: a page that flies but sends nothing for this long is c
 GONE_S: Final = 2.0
 _REFUSE_AGAIN_S: Final = 1.0  # interval between equal refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-# A take-off is no longer repeated if by then the proxy has not acknowledged it or the vehicle has not begun it.
+# Time limits for repeating a take-off: without and with an acknowledgement by the proxy.
 _TAKEOFF_NS: Final = 1_000_000_000
 _BEGUN_NS: Final = 6_000_000_000
 _numbers = itertools.count(1)
@@ -53,7 +53,7 @@ Json = dict[str, Any]
 
 
 class ControlSession:
-    """Serves one control socket of a page from opening to closing. On the event loop."""
+    """Serves one control socket of a page from opening to closing. Used on the event loop."""
 
     def __init__(
         self,
@@ -84,17 +84,17 @@ class ControlSession:
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
         self._steering = False  # whether the newest set-point is a velocity from this page's sticks
-        self._stood_down = False  # whether it stood down with the vehicle under way, and has commanded nothing since
+        self._stood_down = False  # whether it stopped commanding the vehicle in mid-flight, and has not resumed since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._decided = ("", 0)  # ``do`` and ``n`` of the page's last decision, which may still be refused or waiting
-        # The last command that replaced another one, and its first intent.
+        self._decided = ("", 0)  # ``do`` and ``n`` of the page's last decision, even if it was refused or is waiting
+        # The last command that ended an earlier one, and the number of its first intent.
         self._last_command, self._first = ("", 0), 0
         self._decisions = 0  # counts commands that fly or end a flight; compared by jobs that have waited
         self._hands = commands.HandWatch()
         self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
-            None  # do, n, states that complete it, time of the start
+            None  # ``do``, ``n``, the states that complete it, and the start time
         )
         self._repeated = False  # whether the take-off was repeated for as long as allowed
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # last refusal of a stick command: reason and time [s]
@@ -147,7 +147,7 @@ class ControlSession:
             finally:
                 self._station.sessions.discard(self)
 
-    # Messages of the page --------------------------------------------------------------------------------------
+    # Messages from the page ------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
         """Carry out the page's commands. Of the stick commands that have queued up, use only the newest."""
@@ -183,9 +183,9 @@ class ControlSession:
             self._refuse_command(command, str(error))
 
     def _on_ping(self, ping: Alive, now_ns: int) -> None:
-        """Mark the page as present since it last received data from the cockpit, and answer."""
+        """Answer, and treat the page as present until :data:`GONE_S` after it last received data from the cockpit."""
         if ping.seen_s is not None and self._pilot is not None:
-            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # never in the future, whatever it claims
+            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # in case the page claims a time in the future
             self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
         self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
 
@@ -222,7 +222,7 @@ class ControlSession:
             yield
 
     def _hover_here(self, command: commands.HoverHere) -> None:
-        """Hover because the person decided so, or because the page reports that no key or stick is held."""
+        """Hover because a person asked for it, or because the page reports that no key or stick is held."""
         if command.automatic:
             self._held()
             self.let_go("nothing is held on the page")
@@ -270,7 +270,7 @@ class ControlSession:
     def _steer_route(self, command: AnyCommand, act: Callable[[RouteSession], None]) -> None:
         pilot, route = self._held(), self._route
         if route is None or route.law.over:
-            raise RefusedError("no route is flown from this page")
+            raise RefusedError("this page is not flying a route")
         if isinstance(command, commands.ResumeRoute):
             self._end_flight()
         with _else_hovering(pilot, "its route can't be changed"):
@@ -283,7 +283,7 @@ class ControlSession:
         self._acknowledge(command)
 
     async def _follow_target(self, command: commands.FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track the content of a box. Without a mode, this needs no authority."""
+        """Track the content of a box. The authority is needed only if a mode is given."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
@@ -312,7 +312,7 @@ class ControlSession:
 
     async def _stop_motors(self, command: commands.Stop) -> None:
         """Stop the motors, retrying as long as the page shows the command as pending."""
-        assert command.at_s is not None  # otherwise it would be untimely
+        assert command.at_s is not None  # a command without a time has already been refused
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
         try:
             await self._station.stop_motors(until_ns, lambda: self._acknowledge(command))
@@ -403,21 +403,21 @@ class ControlSession:
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
         """Return a check to use in place of :meth:`_held` in a job that waits for answers.
 
-        The check raises :class:`RefusedError` if another command has flown or ended a flight in the meantime (the
+        The check raises :class:`RefusedError` if another command has flown or ended a flight since then (the
         newest decision wins), or if the command has become too old.
         """
         number = self._decisions
 
         def held() -> PilotConnection:
             if self._decisions != number:
-                raise RefusedError("something else was commanded meanwhile, or the page was silent")
+                raise RefusedError("another command was given, or the page was silent")
             if problem := untimely(command, seconds(self._clock())):
                 raise RefusedError(problem)
             return self._held()
 
         return held
 
-    # The dead-man ----------------------------------------------------------------------------------------------
+    # The dead-man switch ---------------------------------------------------------------------------------------
 
     def _restart_silence_timer(self) -> None:
         """Restart the timer after a sign of life from the page."""
@@ -436,11 +436,11 @@ class ControlSession:
 
     @property
     def _is_under_way(self) -> bool:
-        """Whether this page has the vehicle under way: by sticks, to a waypoint, along a route or after a target."""
+        """Whether this page is flying the vehicle: with sticks, to a waypoint, along a route or after a target."""
         route = self._route is not None and self._route.is_under_way
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
-    def _end_flight(self, why: str = "something else was commanded, or the page was silent") -> None:
+    def _end_flight(self, why: str = "another command was given, or the page was silent") -> None:
         """End the page's previous flight. A route is only paused and can be resumed."""
         self._decisions += 1
         if self._decided != self._last_command:  # earlier intents and their refusals belong to the previous command
@@ -453,7 +453,7 @@ class ControlSession:
         self._place.cancel()
 
     def let_go(self, why: str) -> None:
-        """Hover if this page has the vehicle under way. A take-off or landing completes safely without the page."""
+        """Hover if this page is flying the vehicle. A take-off or landing completes safely without the page."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         pilot = self._pilot
@@ -482,14 +482,14 @@ class ControlSession:
         """Wait for running jobs and release the authority."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         await self._follow.close()
-        self.let_go("the page is gone")  # control may only now have been taken, or a flight begun
+        self.let_go("the page is gone")  # a job may only now have taken control or begun a flight
         await self._close_pilot()
         await self._station.pilot_went()
 
     # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Send changes of the authority and of open questions to the page, and report completed commands."""
+        """Send changes in the authority and in open questions to the page, and report completed commands."""
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
@@ -504,7 +504,7 @@ class ControlSession:
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
                     with suppress(SkyloopError):
-                        pilot.idle()  # one already begun continues; others must not begin when a slow link recovers
+                        pilot.idle()  # one under way continues, but none may begin when a slow link recovers
             with suppress(LinkError):
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
@@ -525,12 +525,12 @@ class ControlSession:
         watched = self._follow.is_under_way or (self._route is not None and self._route.is_under_way)
         refused = outcome.fate in (Fate.UNDER_WAY, Fate.REFUSED, Fate.OTHERS)
         if not watched and (refused or self._awaited or self._is_under_way):
-            self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows whose
+            self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows its own name
         if watched or self._place.is_under_way:
-            self.let_go(outcome.text)  # this feedback also shows whether others have taken the vehicle
+            self.let_go(outcome.text)  # this feedback also shows whether others have taken control
         elif self._last_command[0] == commands.TakeOff().do:
             with suppress(SkyloopError):
-                pilot.idle()  # otherwise it would take off unexpectedly as soon as it can
+                pilot.idle()  # otherwise it would take off unexpectedly as soon as it could
         self._awaited = None
 
     def _refuse(self, do: str, n: int, why: str) -> None:

@@ -1,4 +1,4 @@
-"""Find the proxies on this host and on the network, without any of them noticing."""
+"""Find the proxies on this host and on the network without the proxies noticing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class LocalFinder:
     """Finds the proxies on this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
-        """Prepare the search. ``names``: search only for these; empty: all."""
+        """Prepare the search. ``names``: the names to search for; if empty, all."""
         self._names = frozenset(names)
         self._also: set[str] = set()
         self._known: dict[tuple[str, Path], Found] = {}
@@ -84,8 +84,8 @@ class NetworkFinder:
     def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
         """Prepare the search.
 
-        ``local``: finds the proxies of this host. ``settings``: how to join the network. ``wanted``: search only for
-        these names; empty: all.
+        ``local``: finds the proxies of this host. ``settings``: how to join the network. ``wanted``: the names to
+        search for; if empty, all.
         """
         self._local = local
         self._settings = settings

@@ -1,7 +1,7 @@
 """One camera's frames for all pages that show them: encoded to JPEG once for all pages; H.264 is relayed unchanged.
 
 The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. H.264 pictures depend on the
-previous ones, so a page receives all of them in order or resumes at a key picture. Nothing is encoded to H.264 here.
+previous ones, so a page receives all of them in order or resumes at a key frame. Nothing is encoded to H.264 here.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def _give_way() -> None:
 #: One thread for all cameras, because encoding for many pages must not take cores from flying. The event loop keeps its
 #: original priority: a person's sticks and stop pass through it, and a browser must not starve it.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
-KEPT: Final = 16  #: newest pictures kept per form; a page further behind resumes at a key picture
-SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: scales of pictures in panes; few, so that similar panes share a form
-RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s]; few as well
-BITS: Final = 0.12  #: bits per pixel of a moving picture
+KEPT: Final = 16  #: pictures kept per stream; a page further behind resumes at a key frame
+SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: few scales, so that similar panes share a stream
+RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: few rates [kbit/s]
+BITS: Final = 0.12  #: bits per pixel of a video stream
 _FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
 
@@ -213,14 +213,14 @@ class SmallFeed:
         """
         if self._listener is None:
             self._since_ns = self._clock()
-            # Inline, because a thread per camera would be woken for each frame and do no more than this.
+            # Inline, because the callback does very little and a thread per camera would be woken for each frame.
             self._listener = self._drone.on_frame(
                 self._put, camera=self.camera, inline=True, encoding="jpeg", max_fps=FPS, scale=self._scale
             )
         self._pages += 1
 
     def unsubscribe(self) -> None:
-        """Remove a page that showed the camera; the last one unsubscribes from the camera."""
+        """Remove a page that no longer shows the camera; without pages, unsubscribe from the camera."""
         self._pages -= 1
         if self._pages == 0:
             self.close()
@@ -240,16 +240,16 @@ class SmallFeed:
 
 
 def rounded_width(wish: int) -> int:
-    """Return the smallest of :data:`WIDTHS` that is at least ``wish`` [pixels], or the largest if none is."""
+    """Round a width [pixels] up to one of :data:`WIDTHS`, or down to the largest."""
     return next((width for width in WIDTHS if width >= wish), WIDTHS[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a camera's pictures are encoded. Without rate and subscriber, they are as the vehicle encodes them.
+    """The encoding of a camera's stream: by default, the vehicle's own.
 
-    ``kbit_s``: encoded at this rate, once for all subscribers of the same form. ``subscriber``: encoded for this
-    subscriber alone, at the rate and size that its path can carry.
+    ``kbit_s``: the bit rate of a stream shared by all subscribers with the same values. ``subscriber``: the name of the
+    only subscriber, for which rate and size are adapted to its path.
     """
 
     kbit_s: int | None = None
@@ -259,17 +259,17 @@ class Form:
 
     @property
     def kind(self) -> str:
-        """Who the form is for: ``vehicle``, ``shared`` or ``own``."""
+        """The kind of stream: ``vehicle`` (its own encoding), ``shared``, or ``own`` for a single page."""
         if self.subscriber:
             return "own"
         return "vehicle" if self.kbit_s is None else "shared"
 
 
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
-    """Choose the form that all panes of about the same size share.
+    """Return the encoding shared by all panes of about the same size.
 
-    ``width``: width of the pane [device pixels]; 0: full size. ``max_fps``: maximum number of pictures per second;
-    None: all.
+    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum number of pictures per second,
+    None for no limit.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -283,9 +283,9 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
 
 
 class EncodedFeed:
-    """The newest pictures in one form, while a page shows them. Created and used on the event loop."""
+    """The newest pictures of one H.264 stream, while a page shows it. Created and used on the event loop."""
 
-    encoded = 0  #: number of frames encoded here: none
+    encoded = 0  #: number of frames encoded here; always 0, because H.264 is only relayed
 
     def __init__(self, drone: Drone, camera: str, form: Form, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
@@ -310,8 +310,8 @@ class EncodedFeed:
     def age_s(self) -> float | None:
         """Age of the newest picture [s].
 
-        None while no page shows the camera, before the first picture, and while waiting for the one page that the form
-        is for, which says nothing about the camera.
+        None while no page shows the camera, before the first picture, and for a stream to a single page, whose age
+        depends on that page's path rather than on the camera.
         """
         with self._lock:
             newest = self._pictures[-1] if self._pictures else None
@@ -321,17 +321,17 @@ class EncodedFeed:
 
     @property
     def silent_s(self) -> float:
-        """Time without a picture [s]; 0 if the reason may be that the one page it is for accepts none."""
+        """Time without a picture [s]; 0 if the stream's only page may simply not be accepting any."""
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
 
     def stats(self) -> ChannelStats:
-        """Return the stream's statistics, in the form of a channel's."""
+        """Return the stream's statistics, as for a channel."""
         return self._counter.stats(self._clock())
 
     def subscribe(self, page: object, wake: Wake | None) -> None:
-        """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key picture.
+        """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key frame.
 
         ``wake``: called on the event loop for each picture; None if the page polls. Raise ``SkyloopError`` if the drone
         was closed, or no longer has this camera.
@@ -354,7 +354,7 @@ class EncodedFeed:
             self._wakes[page] = wake
 
     def unsubscribe(self, page: object) -> None:
-        """Remove a page that showed the pictures; the last one unsubscribes from the stream."""
+        """Remove a page that no longer shows the pictures; without pages, unsubscribe from the stream."""
         with self._lock:
             self._wakes.pop(page, None)
         if not self.wanted:
@@ -369,10 +369,10 @@ class EncodedFeed:
                 self._pictures.clear()
 
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
-        """Return the next pictures for a page, in order, and how many it misses before them.
+        """Return the next pictures for a page, in order, and the number of pictures skipped before them.
 
-        ``serial``: number of the last picture sent to the page; 0: none yet. ``follows``: whether the page can decode
-        the next picture; if not, it resumes at a key picture.
+        ``serial``: number of the last picture sent to the page, or 0. ``follows``: whether the page can decode
+        the next picture; if not, it resumes at a key frame.
         """
         with self._lock:
             newer = [one for one in self._pictures if one.serial > serial]
@@ -390,7 +390,7 @@ class EncodedFeed:
         return chosen, chosen[0].serial - serial - 1 if serial else 0
 
     def ask_for_key(self) -> None:
-        """Request a key picture from the proxy, but only a few times a second."""
+        """Request a key frame from the proxy, but only a few times a second."""
         if self._channel is not None:
             self._channel.report(0, wants_key=True)
 

@@ -42,20 +42,20 @@ V = TypeVar("V")
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread. Do nothing if the loop is closed, because no pages are left."""
+    """Call a function on the loop, from any thread. Do nothing if the loop is closed and no pages are left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
 
 
 def start_task(work: Coroutine[Any, Any, None], running: set[asyncio.Task[None]]) -> None:
-    """Run a coroutine as a task, which stays in the set until it has ended: the loop itself keeps no task alive."""
+    """Run a coroutine as a task, which stays in the set until it has ended, because the loop does not keep it alive."""
     task = asyncio.create_task(work)
     running.add(task)
     task.add_done_callback(running.discard)
 
 
 class PeriodicBroadcast:
-    """Creates a message at a steady rate, once for all subscribers, while there are any. On the event loop."""
+    """Creates a message at a steady rate, once for all subscribers, while there are any. Used on the event loop."""
 
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
         """Initialise without starting; the first subscriber starts it.
@@ -126,13 +126,13 @@ class Newest(Generic[K, V]):
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: number of values refused for lack of a place
+        self.refused = 0  #: number of values refused for lack of room
         self._most = most
         self._clock = clock
         self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the most recently updated comes last
 
     def put(self, key: K, value: V) -> None:
-        """Set a key's value. If there is no place for a new key, refuse and count it."""
+        """Set a key's value. If there is no room for a new key, refuse it and count the refusal."""
         now_ns = self._clock()
         if self._values.pop(key, None) is None and len(self._values) >= self._most:
             oldest = next(iter(self._values))
@@ -211,7 +211,7 @@ class EventFeed:
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return the events with higher numbers, together with these numbers, oldest first."""
+        """Return the events numbered above ``number``, with their numbers, oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class EventFeed:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        """Keep a drawing. Runs on the client's thread; any number of drawings schedules one call on the loop."""
+        """Keep a drawing. Runs on the client's thread, and schedules only one call on the loop for several drawings."""
         self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
         if not self._waking:
             self._waking = True
@@ -252,7 +252,7 @@ class LogFeed:
         self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe; or unsubscribe and forget the values."""
+        """Subscribe if the values are wanted; otherwise unsubscribe and forget them."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -271,7 +271,7 @@ class LogFeed:
 
     @property
     def refused(self) -> int:
-        """Number of logged values refused for lack of a place."""
+        """Number of logged values refused for lack of room."""
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:

@@ -35,12 +35,12 @@ LOOK_S: Final = 0.5
 FORGET_S: Final = 60.0  #: a drone lost for longer than this is no longer shown
 CONNECT_S: Final = 3.0
 OVERVIEW_S: Final = 0.5  #: interval between overviews sent to pages
-FIRST_SEARCH_S: Final = 2.0  #: time that the first pages wait for drones that answer slowly
+FIRST_SEARCH_S: Final = 2.0  #: maximum time for which the first pages wait for slow drones
 
 Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
 LANDING_S: Final = 60.0  #: time for which a landing is repeated
-BEGIN_S: Final = 2.0  #: without a connection by then, a landing is not begun
+BEGIN_S: Final = 2.0  #: time limit for the connection that is needed to begin a landing
 _POLL_S: Final = 0.05
 
 Json = dict[str, Any]
@@ -79,7 +79,7 @@ class Fleet:
         self._clock = clock
         self._search_period_s = look_s
         self._seen_ns: dict[str, int] = {}
-        self._found: dict[str, Found] = {}  # as found in the last search
+        self._found: dict[str, Found] = {}  # the proxies found by the last search
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
@@ -109,7 +109,7 @@ class Fleet:
         start_task(work, self._begun)
 
     async def search(self) -> None:
-        """Search once: start connecting to new proxies, and remove those that are gone for good."""
+        """Search once: start connecting to new proxies, and remove those that are gone permanently."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -136,7 +136,7 @@ class Fleet:
 
     @property
     def unreached(self) -> dict[str, str]:
-        """Drones that were found but can't be commanded because they are not connected; reasons by name."""
+        """Names of drones that were found but are not connected and can't be commanded, with the reasons."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
@@ -216,7 +216,7 @@ def _silent(name: str, problem: str) -> dict[str, Any]:
 
 
 class FleetSession:
-    """Serves one socket of a pilot's page; its commands complete even if the page goes away. On the event loop."""
+    """Serves one socket of a pilot's page; its commands complete even if the page goes away. Used on the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
         """Prepare the session; :meth:`run` serves it."""
@@ -267,7 +267,7 @@ class FleetSession:
             self._send({"type": "each", **subject, "state": "refused", "why": str(error)})
 
     async def _stop(self, command: StopAll, station: Station, subject: Json) -> None:
-        assert command.at_s is not None  # otherwise it would be untimely
+        assert command.at_s is not None  # a command without a time has already been refused
         station.pilot_came()
         try:
             until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))

@@ -1,4 +1,4 @@
-"""One page's flight after a target that it marked: from the box to set-points and messages. On the event loop.
+"""Fly after a target that a person marked on a page: from the box to set-points and messages, on the event loop.
 
 The content of a box is only tracked until the page sets a mode, either with the box or later
 (:meth:`FollowSession.fly`). In flight, each report from the :class:`~skyloop.cockpit.target_tracker.TargetTracker`
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from skyloop.messages import AnyAction
 
 STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
-OLD_S: Final = 1.0  #: frames older than this when tracked are not used for flying either
+OLD_S: Final = 1.0  #: the vehicle also hovers if a frame is older than this when it is tracked
 OLD_FEEDBACK_S: Final = 1.0
-#: A request older than this no longer starts a flight: the tracker was stuck, or took longer than anyone expects.
+#: Maximum age of a request that may start a flight: by then the tracker is stuck, or nobody expects a flight any more.
 SET_OFF_S: Final = 10.0
 WATCH_S: Final = 0.1  #: interval between checks that the tracker still reports
 NUMBERS_PERIOD_S: Final = 0.2  #: interval between messages that differ only in numbers
@@ -59,7 +59,7 @@ class FollowerFactory(Protocol):
 
 
 class FollowSession:
-    """Tracks one target at a time for a page and follows it. On the event loop.
+    """Tracks one target at a time for a page and follows it. Used on the event loop.
 
     ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; called
     before the first set-point. ``make``: creates followers; called on a thread.
@@ -84,7 +84,7 @@ class FollowSession:
         self._mode = ""
         self._distance_m = 0.0
         self._limits: dict[str, Value] = {}  # the drone's limits, read when the target was marked
-        self._pilot: PilotConnection | None = None  # set while it flies or is about to
+        self._pilot: PilotConnection | None = None  # set while it is flying or about to fly
         self._flying = False
         self._waits = ""  # why it is currently hovering
         self._action: AnyAction | None = None  # the last set-point
@@ -101,7 +101,7 @@ class FollowSession:
         """Whether it commands the vehicle, or is about to."""
         return self._pilot is not None
 
-    # Requests of the page --------------------------------------------------------------------------------------
+    # Requests from the page ------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
         """Keep the frames of a camera until a box arrives or the page cancels.
@@ -126,10 +126,10 @@ class FollowSession:
         Args:
             command: The page's command.
             held: Returns the connection that holds the authority; raises if there is none or a newer command was given.
-                Called only if there is a mode, at the beginning and before the flight.
+                Called only if a mode is given, at the beginning and before the flight.
 
         Raises:
-            AuthorityError: There is a mode, but this page does not hold the authority.
+            AuthorityError: A mode was given, but this page does not hold the authority.
             RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command was given.
             UsageError: The box, mode, distance or camera is invalid.
             MissingExtraError: OpenCV is not installed.
@@ -167,7 +167,7 @@ class FollowSession:
         self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
-        """Follow the tracked target, or change the mode of following.
+        """Follow the tracked target, or change the following mode.
 
         Raise ``RefusedError`` if nothing is tracked, or the vehicle is not in the air, or ``UsageError`` if the mode or
         distance is invalid.
@@ -187,7 +187,7 @@ class FollowSession:
         self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End a flight because something else was commanded or control was lost; tracking continues."""
+        """End a flight because another command was given or control was lost; tracking continues."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -195,7 +195,7 @@ class FollowSession:
         """Forget the target.
 
         ``why``: the reason shown on the page; empty if the person requested it. ``hover``: whether to hover if the
-        vehicle was following; False if something else is commanded.
+        vehicle was following; False if another command is given.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:
@@ -241,7 +241,7 @@ class FollowSession:
 
     def _set_off(self) -> None:
         """Send the first set-point, ending any other flight."""
-        pilot, self._pilot = self._pilot, None  # otherwise clearing would end this flight, too
+        pilot, self._pilot = self._pilot, None  # so that clearing does not end this flight
         self._clear()
         self._pilot, self._flying, self._action = pilot, True, None
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
@@ -351,7 +351,7 @@ def _settings(distance_m: float | None) -> ChaseSettings:
 
 
 def _check_in_air(pilot: PilotConnection) -> Feedback:
-    """Return the newest feedback, checking that the vehicle is in the air and nobody else has control."""
+    """Return the newest feedback, checking that the vehicle is in the air and not flown by others."""
     feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
     if feedback.others:
         raise RefusedError(f"{feedback.others}: hover first to take it over")

@@ -1,10 +1,10 @@
 """Accept connections on the listening socket, and limit their number and how long they may be silent.
 
-A connection is *anonymous* until it has sent a request from an admitted person. There are few places for anonymous
-connections, and the newest always gets one: a connection from the address that has the most is closed, preferably one
-whose request was not admitted, otherwise the oldest. A flood of strangers therefore displaces itself, and a person who
-sends a request at once is served even during a flood. Logged-in people have separate places, some reserved for pilots,
-which no other connection can take. These decisions take the time as an argument.
+A connection is *anonymous* until it has sent a request from an admitted person. The number of anonymous
+connections is limited, but a new one is always accepted: one from the address with the most connections is closed to
+make room, preferably one whose request was rejected, otherwise the oldest. A flood of strangers therefore displaces
+only itself, and people who send a request at once are served even during a flood. Connections of logged-in people have
+a separate limit, and some of them are reserved for pilots. These decisions take the time as an argument.
 
 asyncio's own listener accepts connections until it runs out of descriptors, and then logs errors endlessly. This module
 therefore accepts connections itself and hands them to the HTTP server.
@@ -29,11 +29,11 @@ from skyloop.cockpit.feeds import start_task
 from skyloop.messages import Role
 
 MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
-MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six, and several may share an address
+MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six connections, and several browsers may share an address
 MAX_KNOWN: Final = 512  #: a page that shows a drone with two cameras has about eight
-MAX_KNOWN_OF_ADDRESS: Final = 192  #: for people in one role: a page, a classroom behind one router, a measuring program
+MAX_KNOWN_OF_ADDRESS: Final = 192  #: limit per role; a whole classroom may share one address
 _PILOTS_SHARE: Final = 0.25  # fraction of the known connections reserved for pilots
-DESCRIPTORS_LEFT: Final = 128  #: number reserved for drones, recordings, children and files
+DESCRIPTORS_LEFT: Final = 128  #: descriptors reserved for drones, recordings, child processes and files
 
 HEADER_S: Final = 5.0  #: time limit for a TLS handshake and a whole request
 NEXT_S: Final = 10.0  #: time limit for the next request on a connection; the server closes idle ones sooner
@@ -56,7 +56,7 @@ class Places:
 
     @classmethod
     def within(cls, descriptors: int) -> Places:
-        """Return the places for a process that may open this many descriptors."""
+        """Return the limits for a process that may open this many descriptors."""
         share = min(1.0, max(descriptors - DESCRIPTORS_LEFT, descriptors // 4) / (MAX_ANONYMOUS + MAX_KNOWN))
         most = (MAX_ANONYMOUS, MAX_ANONYMOUS_OF_ADDRESS, MAX_KNOWN, MAX_KNOWN_OF_ADDRESS)
         return cls(*(max(1, int(number * share)) for number in most))
@@ -70,7 +70,7 @@ class Connection:
     end: Callable[[], None]
     person: Person | None = None
     deadline_ns: int | None = None  #: closed if nothing happens by this time
-    asked: bool = False  #: whether it has sent a stranger's request
+    asked: bool = False  #: whether a request from a stranger has arrived on it
 
 
 @dataclass(slots=True)
@@ -176,8 +176,8 @@ class Admission:
         return ""
 
     def _displace(self, address: str) -> None:
-        # Strangers that have sent a request, such as a wrong token, are closed first; otherwise a guesser, whose
-        # answers are delayed, could cut off the handshakes of people at the same address.
+        # Connections on which a stranger's request has arrived, such as a wrong token, are closed first. Otherwise a
+        # guesser, whose answers are delayed, could cut off the handshakes of people at the same address.
         self.counts.displaced += 1
         of_address = self._anonymous[address]
         self._end(next((one for one in of_address if one.asked), next(iter(of_address))))
@@ -188,7 +188,7 @@ class Admission:
 
 
 BACKLOG: Final = 1024  #: connections queued by the kernel; a client retries a dropped one after 1 s
-AT_ONCE: Final = 16  #: connections accepted before the open ones get a turn
+AT_ONCE: Final = 16  #: number of connections accepted before open ones are served again
 PAUSE_S: Final = 0.1  #: pause after the system refused a connection for lack of resources
 SWEEP_S: Final = 0.5  #: interval between sweeps that close silent connections
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
@@ -214,7 +214,7 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as long as the admission has places. On the event loop."""
+    """Accepts connections while :meth:`run` runs, as long as the admission has room. Used on the event loop."""
 
     def __init__(
         self,
@@ -290,7 +290,7 @@ class Listener:
 
 
 def places_here() -> Places:
-    """Return the number of places that this process's descriptor limit allows."""
+    """Return the limits that suit this process's descriptor limit."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -312,7 +312,7 @@ def limit_messages() -> None:
 
 
 class RepeatLimit(logging.Filter):
-    """A log filter that passes each message once per ``every_s`` [s], with the number of those dropped in between.
+    """A log filter that passes each message once per ``every_s`` [s], with the number of repeats that were dropped.
 
     Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
     one that it passed longest ago.
@@ -322,7 +322,7 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # by message without values: time, number dropped since
+        self._logged: dict[str, tuple[int, int]] = {}  # time and number dropped since, by message without values
 
     def filter(self, record: logging.LogRecord) -> bool:
         key, now_ns = f"{record.name} {record.msg}", self._clock()
@@ -332,7 +332,7 @@ class RepeatLimit(logging.Filter):
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        self._logged.pop(key, None)  # keeps the messages ordered by the time they were passed
+        self._logged.pop(key, None)  # so that messages are ordered by when they were last passed
         if len(self._logged) >= _MAX_MESSAGES:
             del self._logged[next(iter(self._logged))]
         self._logged[key] = now_ns, 0

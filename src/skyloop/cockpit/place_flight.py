@@ -1,6 +1,6 @@
 """One page's flights to a place, back to the start or along a route: how they are commanded and how they end.
 
-:class:`skyloop.control.route_law.RouteLaw` decides how a route is flown. On the event loop.
+:class:`skyloop.control.route_law.RouteLaw` decides how a route is flown. Everything runs on the event loop.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: maximum speed on the way to a place
-PERIOD_S: Final = 0.05  #: interval between checks whether it has arrived
+PERIOD_S: Final = 0.05  #: interval between checks for arrival
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
 
@@ -40,7 +40,7 @@ class Leg:
 
 
 def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
-    """Return the flight to the place given in a command.
+    """Plan a flight to the place given in a command.
 
     Raise ``RefusedError`` if the vehicle can't currently be flown to places, ``UsageError`` if a coordinate is out of
     range, or ``LinkError`` if no feedback has been received.
@@ -52,7 +52,7 @@ def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
 
 
 def to_start(pilot: PilotConnection) -> Leg:
-    """Return the flight back to the take-off position.
+    """Plan a flight back to the take-off position.
 
     Raise ``RefusedError`` if the vehicle can't currently be flown to places, or its take-off position is unknown, or
     ``LinkError`` if no feedback has been received.
@@ -95,7 +95,7 @@ class PlaceFlight:
         self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
-        """Stop monitoring, because something else was commanded."""
+        """Stop monitoring, because another command was given."""
         self._station.goals.pop(self._app, None)
         if self._job is not None:
             self._job.cancel()
@@ -172,7 +172,7 @@ class RouteSession:
         self._job = asyncio.create_task(self._watch())
 
     def pause(self, why: str = "", *, hover: bool = True) -> None:
-        """Pause. Without ``hover``, something else was commanded or control was lost."""
+        """Pause. ``hover``: False if another command was given or control was lost."""
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
@@ -182,7 +182,7 @@ class RouteSession:
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
-        """End the route permanently. Without ``hover``, something else was commanded or control was lost."""
+        """End the route permanently. ``hover``: False if another command was given or control was lost."""
         if self._job is not None:
             self._job.cancel()
         self._carry_out(self.law.stop(), send=hover)
@@ -227,7 +227,7 @@ class RouteSession:
 
     def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
-        if automatic and not isinstance(action, Position):  # the route ended this way, not a person
+        if automatic and not isinstance(action, Position):  # the end of the route, not a person, caused it
             pilot.let_go("its route ended", land=isinstance(action, Land))
             return
         if pilot.command(action):

@@ -41,7 +41,7 @@ class Mark(msgspec.Struct, frozen=True):
 
 
 class Notes(msgspec.Struct, frozen=True):
-    """What people wrote about a recording."""
+    """The notes that people have written about a recording."""
 
     text: str = ""
     marks: tuple[Mark, ...] = ()

@@ -1,8 +1,8 @@
 """Recordings on the page: start, stop, list, replay and report on them.
 
-Recorders, reports and replays each run in their own process, and nothing blocks the event loop. A recorder is a child
-process that does not disturb the flight, as is a process that creates a report; a replay is a private proxy. All of
-them end when this process ends for any reason. The number of each is limited, and they start one at a time.
+Recorders, reports and replays each run in their own process, so that they neither disturb flights nor block the event
+loop; the process of a replay is a private proxy. All of them end when this process ends for any reason. The number of
+each is limited, and they start one at a time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from skyloop.recording.reader import Recording
 
 
-REPLAY_S: Final = 60.0  #: for a replay's proxy to answer, which is slow on a busy computer, as the page explains
+REPLAY_S: Final = 60.0  #: time limit for a replay's proxy to start, which is slow on a busy computer
 
 
 class Recorder(Protocol):
@@ -96,7 +96,7 @@ class Replay:
 
     drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
-    recorded: str | None  #: the drone's name in the recording; None: the first one
+    recorded: str | None  #: the drone's name in the recording; None for the first one
 
 
 def progress(status: Status) -> dict[str, Any]:
@@ -121,7 +121,7 @@ NOTE_SHOWN: Final = 200  #: number of characters of a note shown in the list
 
 
 class Recordings:
-    """The recordings in one folder. On the event loop.
+    """The recordings in one folder. Used on the event loop.
 
     ``folder``: created when needed. ``record``: starts a recorder; called on a thread. ``replay``: starts a replay;
     called on a thread.
@@ -313,7 +313,7 @@ class Recordings:
     def _past(self) -> list[Json]:
         found = []
         for path in self._files():
-            with suppress(OSError):  # deleted in the meantime
+            with suppress(OSError):  # the file has just been deleted
                 status = path.stat()
                 found.append((status.st_mtime_ns, path, status.st_size))
         newest = sorted(found, reverse=True)[:MOST_LISTED]
@@ -355,7 +355,7 @@ MAX_WAITING: Final = 4  #: maximum number of waiting requests; a longer queue wo
 NICENESS: Final = 10  #: niceness of the child: pages and flights have priority over reports
 _TAKEN: Final = 4096  # bytes kept from a child's error output
 
-#: Returns the command that reports on FILE, writing to TARGET, optionally for one DRONE.
+#: Function that returns the command for a report on a file, given the file, the target and optionally one drone.
 Command = Callable[[Path, Path, str | None], Sequence[str]]
 
 
@@ -383,7 +383,7 @@ def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[s
 
 
 class Reports:
-    """Creates reports, or another product of a recording, in a child process. On the event loop.
+    """Creates reports or other products of recordings in child processes. Used on the event loop.
 
     A report keeps a core busy for seconds, and any observer may request one. Requests therefore wait in a short queue
     and are refused when it is full. If a client disconnects, its request leaves the queue or its child is ended.
@@ -502,7 +502,7 @@ def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     channels = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.LOGS)
     for item in recording.items(drone, channels):
         if isinstance(item.value, LogEntry) and course.first_ns is None:
-            continue  # replays don't play logs, so a replay does not start with one
+            continue  # a replay does not play logs, so it starts at the first other item
         at_s = round(seconds(course.follow(item.value, item.entry.log_ns) - (course.first_ns or 0)), 3)
         value = item.value
         if isinstance(value, Event) and value.kind not in _LEFT_OUT:

@@ -28,9 +28,7 @@ _REPORT_POLICY: Final = (
 )
 #: A replay's parameters, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = (
-    16_384  #: maximum length of a name or a text in a request; each use has a lower limit and reports it
-)
+_MOST_CHARACTERS: Final = 16_384  #: maximum length of any text in a request; lower limits are checked where it is used
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -194,14 +192,14 @@ class RecordingsApi:
 
     @answered
     async def play(self, request: Request) -> Response:
-        """Pause, resume or move a replay, or change its speed; answer once the replay has accepted the change."""
+        """Pause or resume a replay, or change its position or speed; answer once the replay has accepted the change."""
         wanted = await body_of(request, _Playback)
         name = request.path_params["name"]
         station = self._fleet.station(name)
         if not station.drone.uri.startswith("replay:"):
-            raise UsageError(f"{name} is not a replay: it can't be paused or moved")
+            raise UsageError(f"{name} is not a replay: only replays can be paused or repositioned")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
-        # Pause before moving, and move before resuming: otherwise it would continue from the old position.
+        # Pause before changing the position, and resume after it: otherwise it would continue from the old position.
         values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
         pilot = await station.stopper()  # a pilot's connection; this needs no authority
         for parameter, value in values.items():

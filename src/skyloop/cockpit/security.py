@@ -1,10 +1,10 @@
 """Decide which requests are answered, from the page they come from and the person who sent them. Guards all routes.
 
 A page from another site can make a browser send requests to this server. Three checks prevent that. The ``Host`` header
-must name this server (otherwise a foreign name was pointed at it: DNS rebinding). The ``Origin``, which browsers add to
-every WebSocket and every request that changes something, and which pages can't forge, must be that of this page; a link
-has no origin, but ``Sec-Fetch-Site`` shows where it comes from, and a foreign link may only lead to the page itself.
-Finally, the page may load only its own files and can't be framed (Content-Security-Policy).
+must name this server, to prevent DNS rebinding. The ``Origin`` must be that of this page: browsers add it to every
+WebSocket and every request that changes something, and pages can't forge it. A link has no origin, but
+``Sec-Fetch-Site`` shows where it comes from: a link from another site may only lead to the page itself. Finally, the
+page may load only its own files and can't be framed (Content-Security-Policy).
 
 After these checks the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
 needs: observer by default, pilot for routes that change something.
@@ -27,11 +27,11 @@ from skyloop.messages import Role
 
 LOG_IN: Final = 4401  #: WebSocket close code: not logged in
 NOT_ALLOWED: Final = 4403  #: WebSocket close code: only a pilot may do this
-ADMIT: Final = "admit"  #: key in the connection's state of a function that returns why there is no place for a person
+ADMIT: Final = "admit"  #: key of a function in the connection's state that returns why a person is refused
 _FOREIGN: Final = 1008  # close code: a page from another site
-_LATER: Final = 1013  # close code: currently no place
+_LATER: Final = 1013  # close code: too many connections at present
 
-#: Answered whatever the role: the page itself, and the routes for logging in.
+#: Paths open to everyone: the page itself and the routes for logging in.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
@@ -62,7 +62,7 @@ class Names:
     """The values of ``Host`` that browsers send when they really mean this server.
 
     ``any_address``: also accept any IP address with the right port, because the server listens on all of the machine's
-    addresses. Unlike a name, an address can't be pointed elsewhere.
+    addresses. Unlike a name, an address can't be redirected.
     """
 
     exact: frozenset[str]
@@ -127,7 +127,7 @@ class Guard:
     """ASGI middleware that decides which requests are answered, and adds protective headers to every answer.
 
     :func:`foreign` and :func:`needed` determine which requests it refuses; it stores the sender of all others in
-    ``scope["person"]`` (None: a stranger).
+    ``scope["person"]`` (None for a stranger).
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
@@ -167,7 +167,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # A host name that is not ours gets no answer that a browser would show.
+        # A request for another host name is refused, so its policy needs no host.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (
@@ -185,8 +185,8 @@ def person_of(scope: Scope) -> Person | None:
 async def gone_within(receive: Receive, within_s: float) -> bool:
     """Wait for the client to disconnect.
 
-    ``receive``: the request's function of that name; other messages are dropped. Return whether the client disconnected
-    in time.
+    ``receive``: the request's ``receive`` function; messages other than the disconnect are dropped. Return whether
+    the client disconnected in time.
     """
     try:
         async with asyncio.timeout(within_s):
@@ -214,7 +214,7 @@ async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: in
         await send({"type": "http.response.body", "body": reason.encode()})
         return
     await receive()
-    if code != _FOREIGN:  # our own page gets the reason; browsers hide it for a socket that never opened
+    if code != _FOREIGN:  # accept first: browsers only report the reason for a socket that was open
         await send({"type": "websocket.accept"})
     await send({"type": "websocket.close", "code": code, "reason": reason})
 

@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 RECORDINGS = Path("recordings")  #: the default folder for recordings
 _LARGEST_MESSAGE = 4096  # maximum size of a message from a page [bytes]
-_LOOK_S = 0.05  # interval between checks whether to stop
+_LOOK_S = 0.05  # interval between checks of ``stop``
 _PING_S = 10.0  # a connection that does not answer for this long is closed
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Whom to admit, and from where. By default: this user, on this machine, as a pilot.
+    """Who may connect, and from where. By default: this user, on this machine, as a pilot.
 
     ``host``: the address to listen on; any other than loopback needs ``token_file``, ``client_ca`` or ``pair``.
     ``token_file``: lines of the form ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
@@ -102,17 +102,17 @@ def serve_cockpit(
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) arrives.
 
     Args:
-        names: The drones to show; if empty, all that are found at any time.
+        names: The drones to show; if empty, every drone discovered, including any that appear later.
         port: The TCP port; 0 selects a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
             free one).
-        access: Whom to admit, and from where; by default this user, on this machine, as a pilot.
+        access: Who may connect, and from where; by default this user, on this machine, as a pilot.
         recordings: The folder for recordings, created when needed.
         on_ready: Called once on this thread with the page's address. By default the address is printed, with a QR code
             if others can reach the page and standard output is a terminal.
         stop: Stops the server when set from any thread.
         network: Also show drones reachable over this network.
         world: File or name of a shipped world, used as the surroundings of drones that don't report any.
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: no endpoint.
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None for no endpoint.
 
     Raises:
         UsageError: An address, port or file is invalid.
@@ -249,14 +249,14 @@ def _gate(access: Access, port: int) -> Gate:
 
 
 def _session_file(cookie: str) -> SessionFile | None:
-    """Return the file where sessions outlive this process; None if no folder belongs to this user alone."""
+    """Return the file that keeps sessions between runs; None if no folder belongs to this user alone."""
     if sys.platform != "linux":
         return None
     from skyloop.cockpit.access import SessionFile
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()
-    with suppress(LinkError, OSError):  # otherwise sessions last only as long as this process, which logs that
+    with suppress(LinkError, OSError):  # without it, sessions end with this process, and a warning is logged
         folder.create()
     return SessionFile(folder.path / f"{cookie}.sessions")
 

@@ -1,6 +1,6 @@
-"""Small video streams of many drones for one page: one socket, at a steady rate, one message for all cameras.
+"""Send small video streams from many drones to a page over one socket, at a steady rate, in joint messages.
 
-Otherwise a page that shows twelve drones would need twelve sockets, and would wake up and paint for every frame.
+Otherwise, a page that shows twelve drones would need twelve sockets, and would wake up and repaint for every frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.stream import PageCounts
 
 SEND_HZ: Final = 60.0  #: maximum number of messages per second
-GATHER_S: Final = 0.005  #: time that a picture waits for those of other cameras, which often arrive together
+GATHER_S: Final = 0.005  #: time for which a picture waits for other cameras' pictures, which often arrive together
 MAX_SHOWN: Final = 64  #: maximum number of cameras shown on one page at a time
 _BAD_MESSAGE: Final = 1008
 
@@ -42,7 +42,7 @@ class _Message(msgspec.Struct, forbid_unknown_fields=True):
     """A message from a page.
 
     The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes that) or stops; it can't decode a
-    camera's pictures until the next ``key``; or it acknowledges what it has drawn.
+    camera's pictures until the next key frame (``key``); or it acknowledges what it has drawn.
     """
 
     show: _Place | None = None
@@ -135,7 +135,7 @@ class SmallVideoSender:
             if self._problem:
                 await self._socket.close(_BAD_MESSAGE, self._problem)
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             for shown in self._shown.values():
                 shown.release()
@@ -159,7 +159,7 @@ class SmallVideoSender:
         self._counts.frames_sent += len(heads)
 
     def _pictures(self, shown: _Shown) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """Yield a camera's unsent pictures with their data; several if they are H.264, which depend on one another."""
+        """Yield a camera's unsent pictures and their data; there may be several only for H.264."""
         stream, feed, station = shown.stream, shown.feed, shown.station
         if station is None:
             return

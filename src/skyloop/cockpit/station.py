@@ -32,7 +32,7 @@ TELEMETRY_HZ: Final = 18.0
 FRESH_S: Final = 0.2  #: time limit for fresh feedback to arrive
 PILOT_S: Final = 2.0  #: time limit for opening a pilot's connection
 RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recorded drones
-SHOWN_S: Final = 8.0  #: time for the vehicle to show stopped motors; the stop is repeated for as long
+SHOWN_S: Final = 8.0  #: time for which a stop is repeated until the vehicle reports stopped motors
 STOPPER: Final = "cockpit stop"  #: name of the application that sends emergency stops, and nothing else
 RETRY_S: Final = 0.05  #: pause between attempts to send an emergency stop
 _log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ class PilotConnection(Drone):
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
-        """Repeat commands only while the page is known to be present, because a person flies with it."""
+        """Repeat commands only while the page is known to be present, because a person is flying with it."""
         commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
@@ -96,7 +96,7 @@ class PilotConnection(Drone):
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
-        """Whether a failsafe, a lost link or a lost lease ended this action, and it could now be sent again."""
+        """Whether a failsafe, a lost link or a lost lease ended this action, which could now be sent again."""
         newest, intent = self._newest
         outcome = commands(self).outcome(intent) if newest is action else None
         return outcome is not None and outcome.fate in OVERRULED and commands(self).may_ask
@@ -107,7 +107,7 @@ class PilotConnection(Drone):
         return commands(self).intent
 
     def refusal(self, first: int) -> Outcome | None:
-        """The first command from this number on that was refused or ended, unless :meth:`has_ended` covers it."""
+        """The outcome of a refused or ended command with at least this number, unless :meth:`has_ended` covers it."""
         told = commands(self).told
         if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
             return None
@@ -121,12 +121,12 @@ class PilotConnection(Drone):
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover or land because the cockpit, not a person, has to; see :func:`skyloop.extend.let_go`."""
+        """Hover or land on the cockpit's initiative rather than a person's; see :func:`skyloop.extend.let_go`."""
         return let_go(self, reason, land=land)
 
     @property
     def is_flying(self) -> bool:
-        """Whether the vehicle is under way, as far as known."""
+        """Whether the vehicle is flying rather than hovering, according to the newest feedback."""
         try:
             return self.feedback().state is FlightState.FLYING
         except LinkError:
@@ -146,7 +146,7 @@ class FlyingSession(Protocol):
         """Send no more commands."""
 
     def let_go(self, why: str) -> None:
-        """Hover if the vehicle is under way because of this page."""
+        """Hover if this page is flying the vehicle."""
 
 
 class Station:
@@ -162,11 +162,11 @@ class Station:
         self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
-        self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
+        self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: H.264 streams by camera and encoding
         self.goals: dict[str, Waypoint] = {}  #: where pages fly the drone to, by application name
         self.routes = CheckedRoutes()
         self.sessions: set[FlyingSession] = set()  #: sessions of pages that may fly it
-        self.pilots: set[PilotConnection] = set()  #: pages' connections for flying
+        self.pilots: set[PilotConnection] = set()  #: connections over which pages fly the drone
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
@@ -190,7 +190,7 @@ class Station:
 
     @property
     def feeds(self) -> list[CameraFeed | SmallFeed | EncodedFeed]:
-        """The feeds of all cameras, in all sizes and forms."""
+        """The feeds of all cameras, in all sizes and encodings."""
         return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
     def camera_info(self, name: str) -> CameraInfo | None:
@@ -211,7 +211,7 @@ class Station:
         return self.small.get((name, width))
 
     def encoded(self, name: str, form: Form) -> EncodedFeed:
-        """Return the feed of a camera's H.264 in one form; call :meth:`forget` once no page shows it."""
+        """Return the feed of a camera's H.264 in one encoding; call :meth:`forget` once no page shows it."""
         if (name, form) not in self.streams:
             self.streams[name, form] = EncodedFeed(self.drone, name, form)
         return self.streams[name, form]
@@ -281,7 +281,7 @@ class Station:
         self.pilots.discard(pilot)
 
     def pilot_came(self) -> None:
-        """Prepare the connection for emergency stops, for a page that may stop the motors."""
+        """Open the connection for emergency stops if needed, because a page that may send one has connected."""
         self._may_stop += 1
         if self._stopper is None:
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
@@ -301,7 +301,7 @@ class Station:
         return await asyncio.shield(self._stopper)
 
     async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
-        """Stop the motors over a connection used for nothing else, during which no page flies the vehicle.
+        """Stop the motors over a dedicated connection; until that is done, no page may fly the vehicle.
 
         Args:
             until_ns: Latest time to send the stop for the first time, on this process's monotonic clock.
@@ -317,7 +317,7 @@ class Station:
             for session in self.sessions:
                 try:
                     session.stand_down("the motors were stopped")
-                except Exception:  # noqa: BLE001  (the motors are stopped whatever fails in one page)
+                except Exception:  # noqa: BLE001  (a failure of one page must not prevent the stop)
                     _log.exception("%s could not stand down", session.app)
             stopper = await self._send_stop(until_ns)
             sent()
@@ -330,7 +330,7 @@ class Station:
             self._stops -= 1
 
     def check_stop(self) -> None:
-        """Raise :class:`RefusedError` while an emergency stop is in progress that the vehicle does not show yet."""
+        """Raise :class:`RefusedError` while the vehicle has not yet reported the result of an emergency stop."""
         if self._stops:
             raise RefusedError("an emergency stop is under way: other commands wait until the vehicle shows it")
 
@@ -345,7 +345,7 @@ class Station:
                     return stopper
                 why = f"the link to the proxy is {stopper.link.application}"
                 with suppress(SkyloopError):
-                    stopper.idle()  # or it would be sent whenever the link is restored: this loop retries instead
+                    stopper.idle()  # this loop retries; otherwise it would be sent whenever the link is restored
             except LinkError as error:
                 why = str(error)
             except TimeoutError:
@@ -391,7 +391,7 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
 
 
 def _nothing(_: Feedback) -> None:
-    """Consume feedback, so that all of it arrives; pages show the newest."""
+    """Ignore feedback; a callback is needed for it to arrive at all, and pages show the newest."""
 
 
 def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:

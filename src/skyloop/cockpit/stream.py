@@ -1,7 +1,7 @@
 """Send data to pages, with one object per open socket. A page that does not keep up gets less data, never older data.
 
 Video: only one JPEG is in flight at a time; the page gets the newest one after it has drawn and acknowledged the last.
-Several H.264 pictures are in flight, because they depend on one another; a page that skips one resumes at a key one.
+Several H.264 pictures may be in flight, because they depend on one another; after a gap, a page needs a key frame.
 Telemetry: the newest state about 20 times a second, or as fast as the socket accepts it, created once for all pages.
 """
 
@@ -29,32 +29,32 @@ if TYPE_CHECKING:
     from skyloop.client import Frame
 
 
-# One camera as H.264 on one page: its form and its pictures ---------------------------------------------------------
+# One camera as H.264 on one page: the choice of its stream, and its pictures -----------------------------------------
 #
-# Pages that keep up share a form. A page whose acknowledgements arrive late gets its own stream, with a rate and size
+# Pages that keep up share a stream. A page whose acknowledgements arrive late gets its own stream, with a rate and size
 # adapted to the path to that page, until nothing has been late for a while.
 
 
 LATE_S: Final = 0.25  #: a picture acknowledged after more than this is late
 FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all pictures were late for this long
-QUIET_S: Final = 10.0  #: after this long without a late picture it shares a stream again; doubles with each relapse
+QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stream again; doubled after a relapse
 MOST_QUIET_S: Final = 160.0
-SILENT_S: Final = 3.0  #: give up on a form after this much silence
-RETRY_S: Final = 10.0  #: pause before trying it again, doubled each time …
-MOST_RETRY_S: Final = 300.0  #: … up to this: each attempt makes a refusing proxy report it
-MOST_UNDER_WAY: Final = 8  #: number of pictures sent and not yet acknowledged
-MOST_BYTES: Final = 1_000_000  #: total size of these pictures [bytes], unless a single one is larger
+SILENT_S: Final = 3.0  #: give up on a stream after this long without a picture
+RETRY_S: Final = 10.0  #: first pause before trying the stream again, doubled each time
+MOST_RETRY_S: Final = 300.0  #: longest pause; a proxy that refuses the stream reports each attempt
+MOST_UNDER_WAY: Final = 8  #: maximum number of pictures sent and not yet acknowledged
+MOST_BYTES: Final = 1_000_000  #: maximum total size of these pictures [bytes]; a single one may be larger
 
 
 class PagePath:
-    """Judges from its acknowledgements whether a page keeps up. Pure: the time is an argument."""
+    """Decides from a page's acknowledgements whether it keeps up. Pure; takes the time as an argument."""
 
     def __init__(self) -> None:
         self.behind = False  #: whether it needs a lower rate than other pages get
-        self.late_here = False  #: whether that is not because of its own path: pictures reached the cockpit late
+        self.late_here = False  #: whether pictures were already late when they reached the cockpit
         self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time sent
         self._trip_s = 0.0  # round-trip time of the newest acknowledged picture
-        self._changed_ns: int | None = None  # since when all are late, or none is
+        self._changed_ns: int | None = None  # time of the last change of ``_was_late``
         self._was_late = False
         self._quiet_s = QUIET_S
         self._back_ns: int | None = None
@@ -110,14 +110,14 @@ class Sent:
     picture: EncodedFrame
     form: Form
     age_s: float
-    late_here: bool = False  #: whether the page has its own form because pictures reach the cockpit late
+    late_here: bool = False  #: whether the page has its own stream because pictures reach the cockpit late
 
 
 class PageStream:
-    """One camera for one page.
+    """One camera's H.264 stream to one page.
 
-    ``width``: of the pane [device pixels]; 0: full size. ``max_fps``: most pictures a second; None: all. ``wake``:
-    called on the event loop for each picture; None: the page polls.
+    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum frame rate, None for no limit.
+    ``wake``: called on the event loop for each picture; None if the page polls.
     """
 
     def __init__(
@@ -139,18 +139,18 @@ class PageStream:
         self._clock = clock
         self._name = ""  # name of the page's own stream, if it has one
         self._feed: EncodedFeed | None = None
-        self._next: EncodedFeed | None = None  # will replace the current form at its first key picture
+        self._next: EncodedFeed | None = None  # will replace the current stream at its first key frame
         self._serial = 0  # number of the last picture sent
-        self._follows = True  # whether the page can decode the picture after that
-        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, each with its newest picture
+        self._follows = True  # whether the page can decode the next picture
+        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, feeds and numbers of pictures
         self._late_s = 0.0  # delay of the newest picture when it reached the cockpit
-        self._missed = 0  # number of pictures missed before those that are ready
+        self._missed = 0  # number of pictures skipped before those that are ready
         self._refused_ns: int | None = None
         self._retry_s = RETRY_S
 
     @property
     def shows(self) -> bool:
-        """Whether the page receives these pictures; until it does, it needs others."""
+        """Whether the page gets this stream; until then, it needs JPEGs."""
         return self._feed is not None
 
     def resize(self, width: int) -> None:
@@ -195,7 +195,7 @@ class PageStream:
         return self.path.acknowledged(number, self._clock())
 
     def restart(self) -> None:
-        """Resume at a key picture, because the page can't decode the next picture."""
+        """Resume at a key frame, because the page can't decode the next picture."""
         self._follows = False
 
     def close(self) -> None:
@@ -209,14 +209,14 @@ class PageStream:
             self._name = ""
 
     def _ready(self, feed: EncodedFeed, serial: int) -> list[Numbered[EncodedFrame]]:
-        """Return a form's pictures that the page can decode after ``serial``; if none, request a key picture."""
+        """Return the pictures after ``serial`` that the page can decode; if there are none, request a key frame."""
         pictures, self._missed = feed.after(serial, follows=self._follows)
         if not pictures and self._missed:
             feed.ask_for_key()
         return pictures
 
     def _choose(self) -> None:
-        """Subscribe to the form that suits the page now. The current one is used until a key picture arrives."""
+        """Subscribe to the stream that suits the page now; the current one remains in use until a key frame arrives."""
         form = form_for(self._camera, self._width, self._max_fps)
         if self.path.update(self._clock(), self._late_s):
             self._name = self._name or self._station.own_name()
@@ -232,7 +232,7 @@ class PageStream:
         self._release(self._next)
         self._next = None
         if self._feed is not None and self._feed.form == form:
-            return  # it returned to the current form before the other one arrived
+            return  # it returned to the current stream before the other one arrived
         feed = self._station.encoded(self._camera.name, form)
         with suppress(SkyloopError):  # the drone is being closed
             feed.subscribe(self, self._wake)
@@ -291,10 +291,10 @@ class VideoSender:
         self._stream: PageStream | None = None  # set if the page decodes H.264
         self._as_jpeg = False  # whether JPEGs are subscribed to
         self._number = 0  # number of the last message
-        self._sent = 0  # number of the last JPEG sent; not the frame, which would keep its memory from the proxy
+        self._sent = 0  # number of the last JPEG sent; keeping the frame would occupy the proxy's memory
         self._sent_ns = 0  # capture time of the last picture sent
         self._waiting = 0  # number of the JPEG not yet acknowledged
-        self._drawn: dict[str, int] = {}  # capture time of the newest drawing sent, by source; latest last
+        self._drawn: dict[str, int] = {}  # capture times of the last drawings sent, by source in order of sending
 
     async def run(self) -> None:
         """Send until the page disconnects."""
@@ -305,7 +305,7 @@ class VideoSender:
             while not receiver.done():
                 self._choose()
                 with suppress(TimeoutError):
-                    # Even without pictures this must notice that none arrive, or that the page accepts none.
+                    # Wake up regularly, to detect that no pictures arrive or that the page accepts none.
                     await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
                 self._wake.clear()
                 await self._send_pictures()
@@ -314,7 +314,7 @@ class VideoSender:
             if not receiver.result():
                 await self._socket.close(_BAD_MESSAGE, 'expected {"ack": number of a frame}')
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             if self._as_jpeg:
                 self._feed.unsubscribe(self._wake.set)
@@ -325,7 +325,7 @@ class VideoSender:
             await asyncio.gather(receiver, return_exceptions=True)
 
     def _choose(self) -> None:
-        """Subscribe to JPEGs while nothing else is shown to the page."""
+        """Subscribe to JPEGs while the page gets no other stream."""
         as_jpeg = self._stream is None or not self._stream.shows
         if as_jpeg != self._as_jpeg:
             self._as_jpeg = as_jpeg
@@ -455,7 +455,7 @@ class BroadcastSender:
             elif gone.result() != "websocket.disconnect":
                 await self._socket.close(_BAD_MESSAGE, "no messages are expected here")
         except WebSocketDisconnect:
-            pass  # the page disconnected while sending
+            pass  # the page disconnected during a send
         finally:
             self._broadcast.unsubscribe(wake)
             gone.cancel()
@@ -465,7 +465,7 @@ class BroadcastSender:
         await self._socket.send_text(self._broadcast.message.decode())
 
     async def _until_gone(self) -> str:
-        """Return the type of the next message; here, the page is not expected to send any."""
+        """Return the type of the next message; the page should only disconnect."""
         return str((await self._socket.receive())["type"])
 
 
@@ -491,7 +491,7 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page and passes on its commands. On the event loop."""
+    """Sends messages to one page and passes on its commands. Used on the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
@@ -505,7 +505,7 @@ class PageSocket:
     async def serve(self, handle: Callable[[Sequence[str | bytes]], None]) -> None:
         """Call ``handle`` with the messages received since the last call, oldest first, until the page disconnects.
 
-        If this process was suspended, there may be several: the newest is known before the oldest takes effect.
+        There may be several if this process was suspended; ``handle`` then sees the newest before acting on the oldest.
         """
         came: list[str | bytes] = []
         some = asyncio.Event()
@@ -514,7 +514,7 @@ class PageSocket:
             with suppress(WebSocketDisconnect):
                 while (message := await self._socket.receive())["type"] != "websocket.disconnect":
                     came.append(message.get("text") or message.get("bytes") or "")
-                    some.set()  # messages that have already arrived are received without a turn of the loop
+                    some.set()  # messages that have already arrived are read before ``handle`` is called
 
         reading, writing = asyncio.create_task(read()), asyncio.create_task(self._write())
         reading.add_done_callback(lambda _: some.set())

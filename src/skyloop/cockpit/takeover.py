@@ -31,10 +31,10 @@ class TakeoverQuestion:
 
     query: TakeoverQuery
     until_ns: int  #: when the question expires, on the proxy's clock
-    declined: bool = False  #: by this page; a higher priority still gets the authority when the question expires
+    declined: bool = False  #: whether this page refused; a higher priority still gets the authority on expiry
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the question as JSON values; ``now_ns`` is the proxy's clock."""
+        """Return the question as JSON values; ``now_ns`` is on the proxy's clock."""
         return {
             "id": self.query.by_id,
             "by": self.query.request.by,
@@ -59,7 +59,7 @@ class TakeoverQuestions:
         return self._open.get(by_id)
 
     def on_event(self, event: Event, app_id: int) -> bool:
-        """Handle an event as the application with this number."""
+        """Handle an event received by the application with this number."""
         if event.kind is EventKind.AUTHORITY_WITHDRAWN and event.data.get("app_id") == app_id:
             by_id = event.data.get("by_id")
             return isinstance(by_id, int) and self._open.pop(by_id, None) is not None
@@ -93,13 +93,13 @@ class TakeoverQuestions:
 class QueuePosition:
     """A page's position in the queue for the authority."""
 
-    position: int | None  #: 1 is next; None: unknown
-    until_ns: int | None  #: when its turn is expected; None: unknown
+    position: int | None  #: 1 if it is next; None if unknown
+    until_ns: int | None  #: when its turn is expected; None if unknown
     asked: bool  #: whether the holder was asked first
     declined: str | None  #: the holder's reason for keeping it, which may be empty; None if it did not decline
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the position as JSON values; ``now_ns`` is the monotonic clock."""
+        """Return the position as JSON values; ``now_ns`` is on the monotonic clock."""
         wait_s = None if self.until_ns is None else max(0.0, seconds(self.until_ns - now_ns))
         return {"position": self.position, "wait_s": wait_s, "asked": self.asked, "declined": self.declined}
 
@@ -118,14 +118,14 @@ class QueueTracker:
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
-        """Handle an event as the application with this number."""
+        """Handle an event received by the application with this number."""
         if event.kind is EventKind.AUTHORITY_DECLINED and event.data.get("app_id") == app_id:
             self._declined = str(event.data.get("reason", ""))
 
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the page's position in the queue.
 
-        Return None if the page does not wait, otherwise a value equal to the previous one until the status changes.
+        Return None if the page is not waiting. Otherwise, the value only changes when the status does.
         """
         if status.state == "held":  # a pilot that was overruled later gets the authority back without asking
             self.request(ask=False)
@@ -140,7 +140,7 @@ class QueueTracker:
 
 
 class TakeoverDialog:
-    """Handles both sides of a takeover for one page. On the event loop."""
+    """Handles both sides of a takeover for one page. Used on the event loop."""
 
     def __init__(self, send: Callable[[Json], None]) -> None:
         self._send = send
@@ -179,7 +179,7 @@ GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later los
 
 
 class AuthorityReport:
-    """Compares the authority with the last message to the page. On the event loop.
+    """Compares the authority with the last message to the page. Used on the event loop.
 
     ``gone_s``: the page's control expires after this long without a sign of life from the cockpit [s].
     """
@@ -188,8 +188,8 @@ class AuthorityReport:
         self._station = station
         self._app = app
         self._gone_s = gone_s
-        #: As last sent to the page: state, holder, its priority, position in the queue, how control was lost, who
-        #: waits.
+        #: Last values sent to the page: state, holder, its priority, position in the queue, how control was lost, and
+        #: the applications that wait.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None, list[str]] | None = None
         self._was_mine = False
         self._given, self._given_ns = False, 0  # whether and when it was handed over on request
@@ -219,16 +219,16 @@ class AuthorityReport:
             holder, priority = None, None
         mine = state == "held"
         lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
-        if lost or (holder == self._app and not mine):  # left over from earlier
+        if lost or (holder == self._app and not mine):  # the feedback is out of date
             holder = None
         if holder is None:
             priority = None
-        if mine and pilot is not None:  # known here before the feedback shows it
+        if mine and pilot is not None:  # the lease is known here before feedback reports it
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
         if mine != self._was_mine and (mine or monotonic_ns() - self._given_ns > nanoseconds(GIVEN_S)):
-            self._given = False  # the handover was at another time, or the other application did not accept
+            self._given = False  # the handover was long ago, or the other application did not accept it
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         sessions = self._station.sessions
@@ -253,7 +253,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is higher than the holder's, as far as known."""
+        """Return whether a priority is known to be higher than the holder's."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:
@@ -273,7 +273,7 @@ class AuthorityReport:
         )
 
     def _why(self, ended: str, holder: str | None, lost: bool) -> str:
-        """Return in words what happened to the page's control, as it is true now."""
+        """Explain how the page lost control, and name the current pilot."""
         name = self._station.found.name
         now = f"{holder} has control" if holder else "nobody has control"
         if ended == "link" and lost:

@@ -55,7 +55,7 @@ class KeptFrames:
         return len(self._frames)
 
     def add(self, arrival: Arrival) -> None:
-        """Add a frame. If it was captured before the newest one (the proxy restarted), discard the others."""
+        """Add a frame. If the newest one was captured later (the proxy restarted), discard the frames kept so far."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
         self._frames.append(arrival)
@@ -107,9 +107,9 @@ class KeptFrames:
         return best
 
 
-_DEPTH: Final = 8  # frames queued for JPEG encoding: the one shown on the page must not be dropped
-_SAMPLES: Final = 1024  # samples of feedback kept for the frames
-_RESULTS: Final = 16  # results of processors kept
+_DEPTH: Final = 8  # number of frames queued, so that the one shown on the page is not dropped
+_SAMPLES: Final = 1024  # number of feedback samples kept for the frames
+_RESULTS: Final = 16  # number of processor results kept
 
 
 class FrameKeeper:
@@ -146,15 +146,15 @@ class FrameKeeper:
             return self._kept.next_after(captured_ns)
 
     def newest(self, captured_ns: int, timeout_s: float) -> Frame | None:
-        """Wait for a frame other than the one with this capture time; return the newest, or None if too late."""
+        """Wait for a frame other than the one with this capture time; return the newest, or None on time-out."""
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # the frame's memory belongs to the proxy
+            frame, self._newest = self._newest, None  # keep no reference: the frame's memory belongs to the proxy
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:
-        """Return and remove the feedback up to a capture time [ns]; None: all of it."""
+        """Return and remove the feedback up to a capture time [ns], or all of it if that is None."""
         taken = []
         with self._news:
             while self._samples and (until_ns is None or self._samples[0].captured_ns <= until_ns):
@@ -205,7 +205,7 @@ class FrameKeeper:
 
 
 def warm_up() -> None:
-    """Track once, in noise, because imports hold the GIL and would later stall flights through this cockpit.
+    """Track once in a noise image, so that imports, which hold the GIL, do not stall flights later.
 
     SciPy, which matches detections, takes half a second to import on an idle computer and seconds on a busy one. This
     therefore runs when the cockpit starts, on a thread other than the event loop's, rather than when the first target
@@ -241,11 +241,11 @@ class TrackReport:
 
     status: FollowStatus | None  #: the follower's status; None before its first frame
     caught_up: bool  #: whether it has tracked up to the newest frame
-    action: AnyAction | None  #: the current set-point; None if none is wanted, and while catching up
+    action: AnyAction | None  #: the current set-point; None while catching up or if none is needed
     over: bool  #: whether the follower has given up
     size: tuple[int, int]  #: width and height of the frames [px]
-    frame_ns: int  #: when the last frame was tracked, on this process's clock
-    frame_age_s: float  #: age of that frame at that time [s]
+    frame_ns: int  #: time when the last frame was tracked, on this process's clock
+    frame_age_s: float  #: age of the last frame when it was tracked [s]
     problem: str = ""  #: an error in the follower, which is not called again; empty if there is none
 
 
@@ -265,9 +265,9 @@ class TargetTracker:
         report: Callable[[TrackReport], None],
         clock: Clock = monotonic_ns,
     ) -> None:
-        self.steers = False  #: whether set-points are wanted
-        self.mode = ""  #: mode to apply with the next step; empty: unchanged
-        self.settings: Any = None  #: settings to apply with the next step; None: unchanged
+        self.steers = False  #: whether to compute set-points
+        self.mode = ""  #: mode to apply with the next step; empty for no change
+        self.settings: Any = None  #: settings to apply with the next step; None for no change
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
@@ -307,13 +307,13 @@ class TargetTracker:
                 del frame
         except SkyloopError as error:
             self._fail(follower, str(error))
-        except Exception as error:  # noqa: BLE001  (whatever fails in it, the vehicle hovers and the page learns why)
+        except Exception as error:  # noqa: BLE001  (on any failure, the vehicle hovers and the page shows why)
             self._fail(follower, f"tracking failed: {type(error).__name__}: {error}")
         finally:
             self._keeper.close()
 
     def _catch_up(self, follower: Follower) -> None:
-        """Track in the kept frames, starting at that of the box, for at most :data:`KEPT_S`; then in the newest."""
+        """Track in the kept frames from the box's frame on, for at most :data:`KEPT_S`, then in the newest frames."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
         arrival: Arrival | None
         arrival, self._begin = self._begin, None
@@ -339,7 +339,7 @@ class TargetTracker:
                     follower.detected(detections_of(value), result.captured_ns)
         if frame is not None:
             self._track(follower, frame)
-        # A control law that does not fly would expect motion that never happens.
+        # A control law that isn't flying the vehicle would expect motion that never happens.
         action = follower.step(self._clock() + self._drone.clock_offset_ns) if self.steers else None
         self._report(self._made(follower, action))
 
@@ -355,7 +355,7 @@ class TargetTracker:
         self._frame_ns = self._clock()
         self._frame_age_s = frame.age_s
         self._size = frame.shape[1], frame.shape[0]
-        with suppress(UsageError):  # a failed drawing is no reason to end a flight
+        with suppress(UsageError):  # a failed drawing must not end a flight
             self._drone.annotate(frame, shapes, source=SOURCE)
 
     def _made(self, follower: Follower, action: AnyAction | None, *, caught_up: bool = True) -> TrackReport:

@@ -285,8 +285,8 @@ class TelemetryView:
     def holder(self, feedback: Feedback | None) -> str | None:
         """Return the name of the authority's holder.
 
-        None if the lease ended because of silence, although feedback still has the name, and if there is no proxy that
-        could grant a lease.
+        None if no lease is in force, even if feedback still contains the name of its last holder, and while the proxy
+        can't be reached.
         """
         broken = self._links()["application"] in _BROKEN
         return None if feedback is None or broken or not feedback.lease else feedback.owner
@@ -305,7 +305,7 @@ class TelemetryView:
         station, log_feed, feedback = self._station, self._station.log_feed, self._feedback()
         links = self._links()
         if links["application"] in _BROKEN:
-            log_feed.applied = None  # currently unknown, and no longer applied once the link is restored
+            log_feed.applied = None  # unknown while the link is down, and out of date afterwards
         applied = log_feed.applied
         native = None if feedback is None else feedback.native
         proxy_ns = now_ns + station.drone.clock_offset_ns
@@ -379,7 +379,7 @@ class TelemetryView:
             self._channels_task = asyncio.create_task(self._read_channels())
 
     async def _read_channels(self) -> None:
-        # On another thread, because the drone asks the proxy for the command delay and waits for the answer.
+        # Use a thread, because the drone asks the proxy for the command delay and waits for the answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
             for feed in self._station.streams.values():  # H.264 shown on pages does not arrive as frames
@@ -396,6 +396,6 @@ class TelemetryView:
             }
             self._channels = {name: channel_values(one) for name, one in stats.items()}
         except LinkError:
-            pass  # closed in the meantime
+            pass  # the drone has just been closed
         finally:
             self._channels_task = None

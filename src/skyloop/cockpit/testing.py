@@ -7,7 +7,7 @@
     print(pages.frames, pages.newest_age_s)
 
 Each page opens the telemetry and video of one drone and acknowledges every frame, as a page in a browser does after
-drawing it. Nothing is decoded, because drawing costs only the browser.
+drawing it. Nothing is decoded, because drawing costs the cockpit nothing.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Pages:
             address: Address of the cockpit, as printed.
             drone: The drone's name.
             count: The number of pages.
-            **options: As for :class:`HeadlessPage`.
+            **options: Other arguments of :class:`HeadlessPage`.
         """
         self.clients = [HeadlessPage(address, drone, **options) for _ in range(count)]
         self.problem: BaseException | None = None  #: why the pages ended, if they did
@@ -180,7 +180,7 @@ class Pages:
     def close(self) -> None:
         """Close all pages. Idempotent."""
         if self._loop is not None and self._stop is not None and not self._loop.is_closed():
-            with suppress(RuntimeError):  # the loop was closed at just this moment
+            with suppress(RuntimeError):  # the loop has just been closed
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
 

@@ -40,7 +40,7 @@ RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
     """Return a drone's surroundings for maps. This queries its proxy and waits for the answers.
 
-    ``given``: the scenery for a drone that does not report any.
+    ``given``: the scenery to use if the drone reports none.
     """
     read = _reader(drone)
     known = _known(read(WORLD))
@@ -73,7 +73,7 @@ def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
 
 
 def space_from(read: Callable[[str], Value | None]) -> Space:
-    """Return where parameters allow a vehicle to fly; a missing parameter means no limit."""
+    """Return the space in which parameters allow a vehicle to fly; a missing parameter means no limit."""
 
     def edge(name: str) -> float:
         value = read(name)
@@ -86,7 +86,7 @@ def space_from(read: Callable[[str], Value | None]) -> Space:
     try:
         return space_of(edge, text)
     except ParameterError:
-        return Space()  # a driver uses these names for something else
+        return Space()  # the driver uses these parameter names for other values
 
 
 def geometry_values(world: WorldGeometry | None) -> Json:
@@ -142,7 +142,7 @@ def _known(text: Value | None) -> WorldGeometry | None:
     try:
         return decode_world(text)
     except ValueError:
-        return None  # a driver uses this name for something else
+        return None  # the driver uses this parameter name for another value
 
 
 def _limit(value: Value | None) -> float | None:
