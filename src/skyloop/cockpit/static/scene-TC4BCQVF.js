@@ -1,4 +1,4 @@
-import{a as ll,h as fe,p as cl}from"./chunk-X7VYYYYC.js";/**
+import{a as ll,h as fe,p as cl}from"./chunk-TUG2NFWM.js";/**
  * @license
  * Copyright 2010-2025 Three.js Authors
  * SPDX-License-Identifier: MIT
