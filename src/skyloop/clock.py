@@ -18,8 +18,8 @@ from typing import Final
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
-#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of
-#: 5 ms, each packet in a flood could delay a command by that much.
+#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of 5
+#: ms, each packet in a flood could delay a command by that much.
 SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns
@@ -70,13 +70,13 @@ def boot_id() -> str:
 def clock_identity() -> str:
     """Return an identifier of this process's monotonic clock; processes with the same one read the same clock.
 
-    It consists of the kernel's boot and the time namespace. It is empty if the boot is unknown.
+    It combines the kernel's boot ID and the time namespace, and is empty if the boot ID is unknown.
     """
     if not (boot := boot_id()):
         return ""
     try:
         namespace = Path("/proc/self/ns/time").stat().st_ino
-    except OSError:  # a kernel without time namespaces
+    except OSError:  # the kernel has no time namespaces
         namespace = 0
     return f"{boot}/{namespace}"
 
@@ -116,8 +116,8 @@ class LiveClock:
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
         """Return when a picture was captured, never later than it arrived.
 
-        ``stamp_s`` is its timestamp on the stream's clock [s], where a step back resets the estimate; ``arrived_ns`` is
-        on this host's monotonic clock.
+        ``stamp_s`` is its timestamp on the stream's clock [s]; if that clock jumps back, the estimate restarts.
+        ``arrived_ns`` is on this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
         if stamp_ns < self._stamp_ns:  # the stream's clock was set back, so reset the estimate

@@ -16,7 +16,7 @@ class Faults:
     """Faults to inject, as probabilities between 0 and 1 for each packet or frame, in each direction.
 
     ``corrupt`` flips one random bit, in packets only. ``reorder`` holds an item back until the next has passed. Each
-    direction of each connection has its own ``random.Random``, derived from ``seed``.
+    direction of each connection has its own ``random.Random``, seeded from ``seed``.
     """
 
     seed: int = 0
@@ -48,7 +48,7 @@ class FaultInjector:
         return self.items(packet)
 
     def items(self, item: _Item) -> list[_Item]:
-        """Do the same for items of any type, without corruption."""
+        """Do the same for items of any type, but without corruption."""
         held: list[_Item] = self._held  # type: ignore[assignment]
         chance = self._random.random
         if chance() < self._faults.drop:

@@ -17,7 +17,7 @@ from skyloop.errors import FileFormatError, UsageError
 
 T = TypeVar("T")
 
-MAX_TEXT: Final = 1 << 20  #: bytes in a hand-written list
+MAX_TEXT: Final = 1 << 20  #: maximum size of a hand-written list [bytes]
 MAX_RESULTS: Final = 256 << 20  #: bytes in a file of measurements; an hour's worth takes a few megabytes
 
 
@@ -80,7 +80,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; for an unknown user, the path stays as it is and won't be found."""
+    """Expand ``~`` to the home directory; a path with an unknown user is returned unchanged and won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -93,7 +93,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Devices and pipes are written to directly. Raises :class:`UsageError` for an ``OSError``.
     """
-    place = Path(os.path.realpath(path))  # replace the target of a link, and keep the link
+    place = Path(os.path.realpath(path))  # if it is a link, replace its target and leave the link in place
     special = place.exists() and not place.is_file()
     part = place if special else place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
     try:

@@ -46,7 +46,7 @@ def attitude(feedback: Feedback) -> Rotation:
 
 
 def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """Return the vehicle's pose; a given ``position`` (3,) [m] replaces the vehicle's own.
+    """Return the vehicle's pose; ``position`` (3,) [m], if given, replaces the vehicle's own.
 
     Raises :class:`UsageError` while attitude or position is unknown.
     """

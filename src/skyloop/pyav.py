@@ -45,7 +45,7 @@ def new_decoder(
     limit_memory(context)
     if low_delay:
         context.flags |= av.codec.context.Flags.low_delay
-    context.thread_count = 1  # frame threads would delay images
+    context.thread_count = 1  # frame threading would delay images
     return context
 
 
@@ -58,7 +58,7 @@ _TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate contro
 #: Fraction of a second's data that a stream may send at once, which limits the size of a key frame. A slow link has to
 #: carry it before the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3  # maximum factor by which a variable rate increases
+_GROWS: Final = 3  # maximum factor by which a variable rate increases at once
 _FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
 _KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
 #: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
@@ -112,20 +112,20 @@ class H264Encoder:
         return self._most_kbit_s / _FALLS <= kbit_s <= self._most_kbit_s
 
     def set_rate(self, kbit_s: int) -> None:
-        """Change the average rate from the next image on [kbit/s], at no cost; see :meth:`carries`."""
+        """Change the average rate [kbit/s], starting with the next image, at no cost; see :meth:`carries`."""
         self.kbit_s = kbit_s
         self._context.bit_rate = kbit_s * 1000
 
     def encode(
         self, pixels: NDArray[np.uint8], form: str, captured_ns: int, *, key: bool = False
     ) -> tuple[bytes, bool]:
-        """Encode one image, letting other threads run in the meantime.
+        """Encode one image without blocking other threads.
 
         Args:
             pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous; any size is scaled.
             form: FFmpeg's name for the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
             captured_ns: Capture time [ns], later than the previous one.
-            key: Whether to make it a key frame.
+            key: Whether the image becomes a key frame.
 
         Returns the access unit, empty if the encoder returned none, and whether it is a key frame.
         """

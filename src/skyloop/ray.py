@@ -24,7 +24,7 @@ _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK"
 
 
 class Workers:
-    """The actors of one processor, created by :func:`process`. A context manager that ends them."""
+    """The actors of one processor, created by :func:`process`. As a context manager, it ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
         """Keep Ray's handles for the actors."""
@@ -90,7 +90,7 @@ def process(
         drone: Name or address of the drone, as reachable from each actor's host.
         workers: Number of actors, at least 1.
         camera: Name of the camera; None: the vehicle's first.
-        name: Name of the processor; None: the class's in lower case.
+        name: Name of the processor; None: the class's name in lower case.
         shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
         max_age_s: Frames older than this when their turn comes are skipped [s]; None: no limit.
         max_fps: Maximum frame rate of each worker; None: no limit.

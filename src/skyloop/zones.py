@@ -18,7 +18,7 @@ FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is i
 MAX_ZONES: Final = 32
 #: Thinner zones are enlarged to this thickness [m], so that an overshoot or a gust can't carry a vehicle across.
 THINNEST_M: Final = 0.5
-BOX: Final = "safety.box"  #: prefix of the parameters for the box
+BOX: Final = "safety.box"  #: prefix of the box's parameters
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
@@ -55,7 +55,7 @@ class Box:
                 yield Wall((normal[0], normal[1], normal[2]), distance, BOX)
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """Return the wall of a box to stay outside of."""
+        """Return the wall that a vehicle outside the box must not cross."""
         nearest = tuple(max(low, min(high, at)) for low, high, at in zip(self.low, self.high, place, strict=True))
         way = (nearest[0] - place[0], nearest[1] - place[1], nearest[2] - place[2])
         distance = math.hypot(*way)
@@ -148,7 +148,7 @@ class Space:
 
     room: Box | None = None  #: the room's walls, which the vehicle can't pass; None if unknown
     box: Box | None = None  #: the safety box; None if there is none
-    zones: tuple[Zone, ...] = ()  #: the no-fly zones, as written
+    zones: tuple[Zone, ...] = ()  #: the no-fly zones, exactly as given
     #: The zones as they are enforced, made at least :data:`THINNEST_M` thick.
     barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)
 
@@ -157,7 +157,7 @@ class Space:
 
     @property
     def walled(self) -> bool:
-        """Whether there are walls that limit set-points, which a room's walls do not."""
+        """Whether there are walls that limit set-points; the walls of a room do not."""
         return self.box is not None or bool(self.zones)
 
     @property
@@ -177,7 +177,7 @@ class Space:
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
-        """Return what blocks the straight line between two positions, as readable text; empty if nothing does.
+        """Return what blocks the straight line between two positions, as readable text; empty if nothing is in the way.
 
         A zone that contains the start is ignored, so that a vehicle can leave it.
         """
@@ -188,7 +188,7 @@ class Space:
 
 
 def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
-    """Return the space in which parameters, whose values the functions return by name, allow a vehicle to fly.
+    """Return the space in which a vehicle's parameters allow it to fly; the functions return their values by name.
 
     Raises :class:`ParameterError` if the zones can't be parsed.
     """
@@ -207,7 +207,7 @@ def _room(text: str) -> Box | None:
 
 
 def parse_zones(text: str) -> tuple[Zone, ...]:
-    """Parse zones, separated by semicolons. Raises :class:`ParameterError` if that fails, or there are too many.
+    """Parse zones separated by semicolons. Raises :class:`ParameterError` if that fails or there are too many.
 
     A zone is ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. It may be
     preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.

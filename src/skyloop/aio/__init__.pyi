@@ -92,7 +92,7 @@ class Drone:
     Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
     Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
     callbacks are the exception: they are plain functions in their own threads, because image processing would block the
-    event loop. So is the predicate of :meth:`wait`.
+    event loop. The predicate of :meth:`wait` is a plain function, too.
     """
 
     sync: client.Drone
@@ -112,13 +112,13 @@ class Drone:
 
         A JPEG is decoded on another thread, while :meth:`frame` decodes on the event loop.
 
-        Errors are raised by the first iteration, not by the call.
+        The first iteration raises the errors, not the call itself.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, so that n workers, with k from 0, can share the frames.
+                ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
                 ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
                 ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
                 with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
@@ -163,14 +163,14 @@ class Drone:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay across all pilots, requested from the proxy with a wait of up to 0.2 s.
+        callback. Otherwise it is the delay for all pilots, which takes up to 0.2 s to request from the proxy.
         """
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
         """Run the pre-flight checklist; each finding comes with a reason and a remedy.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Reads the proxy's parameters and requests a picture from each camera. Doesn't fly and needs no authority.
+        Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
 
         Args:
             video_s: Total time to wait for pictures [s]; 0: don't check cameras.
@@ -249,7 +249,7 @@ class Drone:
         World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
         ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application goes silent: the vehicle stops there. It is held until the next
+        position does not decay when the application stops sending: the vehicle stops there. It is held until the next
         command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
         obstacles.
 
@@ -268,7 +268,7 @@ class Drone:
             tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
 
         Raises:
-            NoAnswerError: If it does not arrive in time; the message gives its state and, if known, the reason.
+            NoAnswerError: If it has not arrived in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
                 ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
@@ -298,7 +298,7 @@ class Drone:
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it is not over in time; the message gives the vehicle's state and, if known, the reason.
+            NoAnswerError: If it has not ended in time; the message gives the vehicle's state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
@@ -322,15 +322,15 @@ class Drone:
 
         A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
         it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
-        may decline. Once granted, the authority is kept: after a lost link it is requested again, and after a
-        pre-emption it returns when the other application releases it.
+        may decline. Once granted, the authority is kept: after the link is lost it is requested again, and after a
+        pre-emption it is regained when the other application releases it.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
+            priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
             wait_s: How long to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
-            stay: Stay in the queue after ``wait_s`` instead of raising.
+            stay: Whether to stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
             The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
@@ -354,13 +354,13 @@ class Drone:
             ClosedError: If the drone was closed.
         """
     async def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for unread feedback, and return the newest.
+        """Wait for feedback that has not been read yet, and return the newest.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples requested by other consumers are returned, too.
+            max_hz: As for :meth:`feedback`; samples requested by other consumers may be returned, too.
 
         Raises:
             NoAnswerError: If none arrives in time.
@@ -368,7 +368,7 @@ class Drone:
             UsageError: If called from an inline callback, or an option is out of range.
         """
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
-        """Wait for a frame that this method has not returned yet, and return the newest.
+        """Wait for a frame that this method has not returned yet, then return the newest one.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -408,7 +408,7 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Overviews are sent once a second and are much smaller than feedback, which helps applications that watch many
+        Overviews are sent once a second and are much smaller than feedback, so they suit applications that watch many
         vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
@@ -460,7 +460,7 @@ class Drone:
     def recent_events(self) -> list[Event]:
         """Return the last 256 events, oldest first."""
     def hover(self) -> bool:
-        """Stop and hold the position. Return values and exceptions are those of all commands; see :class:`Drone`."""
+        """Stop and hold the position. For return values and exceptions, see :class:`Drone`."""
     def idle(self) -> bool:
         """Keep the authority and leave the vehicle as it is."""
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
@@ -490,8 +490,8 @@ class Drone:
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle reports it
-        (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
+        Requires ``access="pilot"`` but not the authority. The stop is sent at once and repeated until the vehicle
+        reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
         connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
@@ -526,7 +526,7 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
 
-        Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
+        Thread-safe. Returns at once, without requiring the authority. Refusals cause events (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
@@ -628,7 +628,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest ``depth`` unseen frames.
+            function: Called in its own thread with the newest unseen frames, at most ``depth`` of them.
             camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
@@ -655,8 +655,8 @@ class Drone:
 
         Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
         key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
-        ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it doesn't send H.264, encoded by
-        the proxy at the rate that the network path can carry.
+        ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
+        the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
@@ -696,7 +696,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop.
+        It is called on the event loop or, with ``inline``, on the receiving thread.
         """
     def on_feedback(
         self,
@@ -729,7 +729,7 @@ class Drone:
                 them.
         """
     def on_link(self, function: Callable[[LinkStatus], object | Awaitable[object]]) -> Listener:
-        """Call ``function``, on the event loop, whenever one of the two hops changes state; up to 256 changes wait.
+        """Call ``function`` on the event loop whenever one of the hops changes state; up to 256 changes may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop.
         """
@@ -745,7 +745,7 @@ class Drone:
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
+        """Call ``function`` with the annotations that applications draw on frames; up to 256 of them may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -767,7 +767,7 @@ class Drone:
         depth: int | None = None,
         inline: bool = False,
     ) -> Listener:
-        """Call ``function`` with the results of one processor, or of all.
+        """Call ``function`` with the results of one processor or of all processors.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -806,8 +806,8 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
-    task at a time may await them; :meth:`emergency_stop` may be called at any time.
+    :meth:`emergency_stop` are coroutines. :meth:`feedback` is a coroutine too, because ``on_error`` may require a
+    landing. Only one task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
     sync: client.Swarm
@@ -829,14 +829,14 @@ class Swarm:
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
         """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
-        It is a coroutine function. Its exceptions, ``what`` and the result are as for :meth:`skyloop.Swarm.each`.
+        A coroutine function. Exceptions, ``what`` and the result are the same as for :meth:`skyloop.Swarm.each`.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
-        ends, by its time, a ``break``, an exception or Ctrl-C, drones still flying its velocities or attitudes hover at
-        once, because no newer ones would follow.
+        Ends with the swarm. If an iteration takes longer than a period, the schedule restarts from its end. When the
+        loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or attitudes
+        that it sent hover at once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
@@ -856,7 +856,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
-            wait: Wait until each hovers.
+            wait: Wait until every drone hovers.
             timeout_s: How long to wait [s].
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
@@ -881,8 +881,8 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Nothing keeps the drones apart on the way: use :class:`skyloop.control.formation_flight.Formation` to plan safe
-        paths. Drones that are set aside are left out.
+        Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
+            paths. Drones that are set aside are left out.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -908,7 +908,7 @@ class Swarm:
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
-            land: Land there, otherwise hover above it; None: each drone's ``return.land``.
+            land: Whether to land there instead of hovering above it; None: each drone's ``return.land``.
             wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
             timeout_s: How long to wait [s].
 
@@ -966,7 +966,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone with its name, all sent together.
+        """Make each action the newest set-point of the drone that it is for, sending them all at once.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -1021,7 +1021,7 @@ class Swarm:
         A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
 
         Args:
-            wanted: A flight state or its name, several of them, or a predicate on feedback.
+            wanted: A flight state or its name, several of these, or a predicate on feedback.
             timeout_s: How long to wait [s].
 
         Returns:
@@ -1037,7 +1037,7 @@ class Swarm:
         """Names of all drones, including those set aside."""
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones do not take part, by name: those set aside and those that never connected."""
+        """The reasons why drones do not take part, by name: drones that were set aside or never connected."""
     def readmit(self, *names: str) -> None:
         """Reactivate drones that were set aside.
 
@@ -1055,7 +1055,7 @@ class Swarm:
         """
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of a :meth:`send` [s]; None before the first."""
+        """Time between the first and the last command of each :meth:`send` [s]; None before the first call."""
     def __len__(self) -> int: ...
     def __contains__(self, name: object) -> bool: ...
 
@@ -1076,8 +1076,8 @@ def connect(
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
-    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
-    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
+    60 s, it returns even so, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.

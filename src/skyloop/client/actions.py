@@ -42,7 +42,7 @@ AT_REST_M_S: Final = 0.3  #: a vehicle slower than this at its target has arrive
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: maximum age of feedback used to convert a geographic position
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the action may be requested again
-OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: fates of actions that the application itself ended
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: outcomes of actions that the application itself ended
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
 #: States that complete an action if the proxy reports no outcome; a complete action is no longer sent.
@@ -53,7 +53,7 @@ _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     ReturnToStart: frozenset({FlightState.LANDED}),
     ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
 }
-#: Minimum time for which these actions are repeated, because the known state may predate the command.
+#: Minimum time for which these actions are repeated, because the last known state may be older than the command.
 _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(0.3),
     Land: nanoseconds(0.3),
@@ -62,15 +62,15 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     ResetEmergency: nanoseconds(0.1),
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
-    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s and reports whether it may be requested again
+    Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
     Land: nanoseconds(60.0),  # counted from the proxy's last report that it is in progress
     EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
 _MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two set-points, not counting repeats
-_KEEP_NS: Final = nanoseconds(0.5)  #: maximum age at which a set-point that could not be sent is still sent later
+_KEEP_NS: Final = nanoseconds(0.5)  #: a set-point that could not be sent is still sent later if it is at most this old
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
-_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval at which a stop is repeated, whatever the rate of other commands
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval between repeats of a stop, whatever the rate of other commands
 
 
 def checked(action: AnyAction) -> AnyAction:
@@ -122,7 +122,7 @@ def return_action(height_m: object, land: object) -> ReturnToStart:
 def in_world_axes(
     local: tuple[object, object, object], earth: tuple[object, object, object], newest: Feedback | None, age_s: float
 ) -> tuple[object, object, object]:
-    """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
+    """Return x, y, z [m] of a target given in one of two ways; the values of the other are None.
 
     ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m],
     None for the current height. Raises :class:`UsageError` if both forms or neither are given, or a value is not a
@@ -187,7 +187,7 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
 
 
 class ReturnWatch:
-    """Decides whether a return is over. Call it with each new sample of feedback."""
+    """Decides whether a return flight is over. Call it with each new sample of feedback."""
 
     def __init__(self) -> None:
         """Start before the command is sent."""
@@ -216,7 +216,7 @@ class CommandSchedule:
         """Start without a set-point; repeat at 1 to 200 Hz. Raises :class:`UsageError` if an argument is out of range.
 
         After ``stall_s`` without a call, a velocity or attitude decays to hover; ``math.inf``: never. Flights to a
-        target and returns do not decay: the vehicle stops there.
+        target and return flights do not decay: the vehicle stops there.
         """
         if not 1.0 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
@@ -227,7 +227,7 @@ class CommandSchedule:
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
         self.automatic = False  #: whether the newest set-point is the library's own
-        self.over: Outcome | None = None  #: what ended it, once it has ended
+        self.over: Outcome | None = None  #: how the newest intent ended, once it has
         self.owed: Unsent | None = None  #: a one-off request that was not sent
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
@@ -236,12 +236,12 @@ class CommandSchedule:
         self._first_ns = self._period_ns * 5 // 4
         self._new_sent_ns = -_MIN_INTERVAL_NS  # time at which the newest intent was first sent
         self._sent_intent = 0
-        self.due_ns = 0  #: time from which :meth:`next` has something to send
+        self.due_ns = 0  #: time at which :meth:`next` will have something to send
         self._failsafe = Failsafe.NONE
         self._reset_asked_ns: int | None = None  # during a stop
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
-        """Make ``action``, which :meth:`may_ask` allows, the set-point; return the number of this intent.
+        """Make ``action``, already allowed by :meth:`may_ask`, the set-point; return the number of this intent.
 
         ``automatic``: the library's own action, not the application's.
         """
@@ -255,7 +255,7 @@ class CommandSchedule:
         self.latest[type(action)] = self.intent
         self.automatic = automatic
         self._asked_ns = now_ns
-        if stops or type(action) in _DONE_IN:  # rare and important, so send it at once
+        if stops or type(action) in _DONE_IN:  # these are rare and important, so send them at once
             self.due_ns = now_ns
         else:
             self.due_ns = max(now_ns, self._new_sent_ns + _MIN_INTERVAL_NS)
@@ -263,7 +263,7 @@ class CommandSchedule:
 
     @property
     def stopping(self) -> bool:
-        """Whether an emergency stop is in progress, which only another one may replace; see :meth:`may_ask`."""
+        """Whether an emergency stop is in progress, which only another stop may replace; see :meth:`may_ask`."""
         return isinstance(self.action, EmergencyStop)
 
     def may_ask(self, action: AnyAction) -> bool:
@@ -271,7 +271,7 @@ class CommandSchedule:
 
         An emergency stop is repeated until the vehicle reports it, or for 8 s. Until then, this application sends
         nothing else; otherwise a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
-        that was never sent. A reset is sent once the vehicle has reported the stop, if it does so soon.
+        that was never sent. A reset is sent once the vehicle has reported the stop, provided that it reports it soon.
         """
         if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
@@ -279,7 +279,7 @@ class CommandSchedule:
 
     @property
     def open_ns(self) -> int:
-        """Time from which a new set-point is sent at once [ns]."""
+        """When a new set-point may next be sent without delay [ns]."""
         return self._new_sent_ns + _MIN_INTERVAL_NS
 
     def next(self, now_ns: int) -> AnyAction | None:
@@ -307,17 +307,17 @@ class CommandSchedule:
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Record that the result of :meth:`next` was not sent. A later set-point replaces it unless it is a landing."""
+        """Record that the action from :meth:`next` was not sent. A new set-point replaces it unless it is a landing."""
         if isinstance(action, EmergencyStop):
-            if self._new_sent_ns == now_ns:  # its first attempt: it may still be withdrawn, and is abandoned soon
+            if self._new_sent_ns == now_ns:  # first attempt: it may still be withdrawn, and is abandoned soon
                 self._sent_intent = -1
         elif not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if ``action`` neither repeats nor revokes it, so that it must be sent first.
+        """Return :attr:`owed` if it must be sent first because ``action`` neither repeats nor revokes it.
 
-        The library's own actions revoke everything except a landing.
+        Actions by the library itself revoke everything except a landing.
         """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > _KEEP_NS:

@@ -57,7 +57,7 @@ class Authority:
 
 
 def check_seconds(what: str, seconds: object) -> None:
-    """Check a time to wait [s]; raise :class:`UsageError` if it is negative or not a finite number."""
+    """Check a waiting time [s]; raise :class:`UsageError` if it is negative or not a finite number."""
     if not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
         raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
 
@@ -71,7 +71,7 @@ class AuthorityStatus:
     state: AuthorityState = "none"
     lease: int = 0  #: number of the lease while held, otherwise 0
     priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
-    holder: str | None = None  #: name of the application that holds it; None if there is none or it is unknown
+    holder: str | None = None  #: name of the application that holds it; None: none, or unknown
     position: int = 0  #: position in the queue, 1 being next; 0 if unknown
     expected_wait_s: float | None = None  #: if all those ahead keep to their announced times [s]; None if unknown
     until_ns: int | None = None  #: end of the time that was requested, on the proxy's clock; None: unlimited
@@ -83,14 +83,14 @@ class EndedSessions:
     A proxy may not notice that a session has ended before the next one begins; until then, it still has the authority.
     """
 
-    MOST = 256  #: number of remembered sessions
+    MOST = 256  #: maximum number of sessions remembered
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, int], None] = {}
         self._lock = threading.Lock()
 
     def add(self, run_id: int, app_id: int) -> None:
-        """Remember a session; forget the oldest one."""
+        """Remember a session, forgetting the oldest one if there are too many."""
         with self._lock:
             self._known[run_id, app_id] = None
             if len(self._known) > self.MOST:
@@ -103,7 +103,7 @@ class EndedSessions:
 class AuthorityTracker:
     """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
-    #: For this long after a grant, feedback without an owner may predate it.
+    #: Time after a grant during which feedback without an owner may predate the grant.
     SETTLE_NS = nanoseconds(0.5)
 
     def __init__(self, name: str, ended: EndedSessions | None = None) -> None:
@@ -113,7 +113,7 @@ class AuthorityTracker:
         self._owner_id = 0  # the owner in the last feedback; 0: none
         self.app_id = 0
         self.wanted = False  #: the application requested it and has not released it
-        self.pending = False  #: requested on this connection, but not answered yet
+        self.pending = False  #: the authority was requested on this connection, but no answer has arrived yet
         self.status = AuthorityStatus()
         self.last_request = RequestAuthority()  #: the last request, which is repeated on a new connection
         self.declined = ""  #: why the holder declined
@@ -144,18 +144,18 @@ class AuthorityTracker:
 
     @property
     def settled(self) -> bool:
-        """Whether it is held, not wanted, or known from feedback to belong to another application."""
+        """Whether the authority is held, not wanted, or known from feedback to belong to another application."""
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection; older leases are invalid and, in another run, so are application numbers."""
+        """Reset on a new connection: older leases are invalid and, after a restart of the proxy, so are our numbers."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """Handle a lost connection, which ends the authority; it stays wanted if it is to be renewed."""
+        """Handle a lost connection, which ends the authority; if it is to be renewed, it is still wanted."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False
@@ -172,13 +172,13 @@ class AuthorityTracker:
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
         """Record a grant from a reply, an event or feedback; ignore one that has been lost since.
 
-        ``until_ns``: the end of its time, on the proxy's clock; None: unlimited, or known from before.
+        ``until_ns``: when the lease ends, on the proxy's clock; None: never, or as already known.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
             return False  # the late report of an old lease, which has been lost since
         if until_ns is None and lease == self._lease:
-            until_ns = self.status.until_ns  # feedback and some events do not repeat it
+            until_ns = self.status.until_ns  # feedback and some events do not repeat the time limit
         self._lease, self._granted_ns = lease, now_ns
         return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
@@ -212,13 +212,13 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # its time is over, so it is not requested again automatically
+            if data.get("reason") == "expired":  # the lease has run out, so it is not requested again automatically
                 return self.given_back()
             return self._lost(None)
         return False
 
     def feedback(self, feedback: Feedback, now_ns: int) -> bool:
-        """Update from the owner and the lease in feedback, in case events were lost."""
+        """Update the authority from the owner and the lease in feedback, in case events were lost."""
         before_id, self._owner_id = self._owner_id, feedback.owner_id
         if feedback.owner_id == self.app_id and feedback.lease:
             return (
@@ -238,7 +238,7 @@ class AuthorityTracker:
         return False
 
     def _lost(self, holder: str | None) -> bool:
-        """Record that ``holder`` took it over, or that the proxy ended it because this application was silent."""
+        """Record that ``holder`` took over, or that the proxy withdrew the authority because nothing was sent."""
         if not holder and not self.renews:
             return self.given_back()
         state: AuthorityState = "preempted" if holder else "none"
@@ -253,23 +253,23 @@ def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
 
 
-#: True hands it over; False, or a reason as text, declines; None leaves the decision to the proxy.
+#: True hands over the authority; False, or a reason as a string, declines; None leaves the decision to the proxy.
 TakeoverAnswer = bool | str | None
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverRequest:
-    """Another application's request for the authority that this one holds."""
+    """Another application's request for the authority held by this one."""
 
     by: str  #: name of the other application
     priority: int  #: 0 is the highest
     within_s: float  #: after this time [s], it wins if its priority is strictly higher
-    for_s: float | None  #: how long it wants to hold the authority; None: unlimited
+    for_s: float | None  #: how long the application wants to hold the authority [s]; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuery:
-    """A request as received, with the data needed to answer it."""
+    """A request as it was received, with the data needed to answer it."""
 
     request: TakeoverRequest
     lease: int  #: the lease to give up

@@ -1,4 +1,4 @@
-"""Deliver samples from the receiving thread to consumers: channels, callbacks, and newest-wins mailboxes."""
+"""Pass samples from the receiving thread to consumers: channels, callbacks and newest-wins mailboxes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Emit(Protocol):
     def __call__(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None: ...
 
 
-JOIN_S: Final = 2.0  #: how long cancelling waits for a running call
+JOIN_S: Final = 2.0  #: how long cancelling waits for a call in progress [s]
 _REPORT_EVERY_S: Final = 1.0
 _log = logging.getLogger("skyloop")
 
@@ -43,8 +43,8 @@ class Channel(Generic[T]):
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
         """Create a channel without consumers.
 
-        Whenever samples begin or cease to be needed, ``subscribe`` is called with True or False, under the channel's
-        lock.
+        ``subscribe`` is called with True when samples begin to be needed and with False when they no longer are, while
+        the channel's lock is held.
         """
         self.subscribed = False  #: whether samples are needed, because there is a consumer or the channel is kept
         self.kept = False  #: subscribed permanently, by :meth:`keep`
@@ -55,7 +55,7 @@ class Channel(Generic[T]):
         self._subscribe = subscribe
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Add a consumer, called on the publishing thread; ``dropped`` returns how many samples it missed."""
+        """Add a consumer, to be called on the publishing thread; ``dropped`` returns how many samples it has missed."""
         with self._lock:
             self._drops[consumer] = dropped
             self._consumers = (*self._consumers, consumer)
@@ -115,11 +115,11 @@ class Channel(Generic[T]):
 class FollowingChannel(Channel[T], Generic[T, C]):
     """A channel that switches to another camera's channel if the proxy restarts with other cameras.
 
-    It serves callers that name no camera, and so use the vehicle's first. Consumers are added to the current channel.
+    Used by callers that don't name a camera, to get the vehicle's first. Consumers are added to the current channel.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Start with the result of ``find``, called again for each sample of ``changes``; later errors are ignored."""
+        """Start with the result of ``find``, called again after each sample of ``changes``, ignoring errors."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -176,9 +176,9 @@ class Listener(Generic[T]):
     ) -> None:
         """Start calling ``function`` with each sample of ``channel``, of which ``depth`` may wait.
 
-        ``report`` is called with this listener's ``name``, which its thread has, too, and each exception of
-        ``function``; ``on_cancel`` with this listener. ``inline``: call the function on the publishing thread instead
-        of its own.
+        ``report`` is called with this listener's ``name``, which is also the name of its thread, and each exception of
+        ``function``; ``on_cancel`` is called with this listener. ``inline``: call the function on the publishing thread
+        instead of on its own.
         """
         self.name = name
         self.errors = 0  #: number of calls that raised
@@ -272,7 +272,7 @@ class Holder(Protocol[T_contra]):
 class Mailbox(Generic[T]):
     """Keeps the newest ``depth`` items until its consumer takes them, and counts the dropped ones.
 
-    Any number of threads may put items; one thread takes them.
+    Any number of threads may put items; only one takes them.
     """
 
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
@@ -324,7 +324,7 @@ class Mailbox(Generic[T]):
         return None if self.closed else self.take()
 
     def close(self) -> None:
-        """Discard all items, and wake the consumer, which gets None from now on."""
+        """Discard all items and wake the consumer, which then receives None."""
         self.closed = True
         with self._lock:
             self._offered -= len(self._items)  # discarded items count as neither delivered nor dropped
@@ -335,8 +335,8 @@ class Mailbox(Generic[T]):
 class Notifier:
     """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
 
-    Each waiting thread adds its own lock, and then checks its condition once more. This way no notification is
-    missed, and the notifying thread, which receives for all consumers, never acquires a lock.
+    Each waiting thread adds its own lock and then checks its condition again. This way no notification is missed, and
+    the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
     __slots__ = ("_waiting",)
@@ -350,14 +350,14 @@ class Notifier:
         while waiting:
             try:
                 lock = waiting.pop()
-            except IndexError:  # another thread notified at the same time
+            except IndexError:  # another thread is notifying at the same time
                 return
             lock.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until ``ready()`` is true (without limit for None); return whether it became true in time.
 
-        ``ready`` is called on this thread, first at once and then after each notification.
+        ``ready`` is called on this thread, at once and then after each notification.
         """
         if ready():
             return True

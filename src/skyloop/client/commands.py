@@ -48,8 +48,8 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: How long to wait for the proxy to notice the end of an earlier session of this process; this exceeds the time-out
-#: of that session's lease.
+#: Time for the proxy to notice that an earlier session of this process has ended, which exceeds the time-out of that
+#: session's lease.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: An application's requests that an automatic hover by the library must not end.
@@ -86,7 +86,7 @@ class CommandSender:
         changed: Callable[[], None],
         granted: Callable[[int], None],
     ) -> None:
-        """Prepare to send; nothing is sent before :meth:`connected`.
+        """Prepare for sending; nothing is sent before :meth:`connected` is called.
 
         ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
         ``granted`` with the number of each new lease, on the thread that noticed.
@@ -168,7 +168,7 @@ class CommandSender:
                 return
             absent, schedule = known_ns < self._clock(), self.schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
-            ends = kind is Land or (kind is Hover and not schedule.automatic)  # by a person, who may be waiting for it
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # a person may be waiting for it
             if absent and not ends:  # an old set-point must not be revived when the person returns
                 schedule.clear(Fate.WITHDRAWN)
                 if kind in (Velocity, Attitude):
@@ -183,22 +183,22 @@ class CommandSender:
     # For the application ---------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action``, with numbers already checked, the newest set-point; see :class:`skyloop.Drone`.
+        """Make ``action``, whose numbers have been checked, the newest set-point; see :class:`skyloop.Drone`.
 
         With ``now``, raise if it can't be sent at once; in that case only a landing is still sent later. ``automatic``:
-        it is the library's own, so it never takes a vehicle from others, and passes :meth:`bar`.
+        the library itself requests it, so it never takes a vehicle from others, and :meth:`bar` does not stop it.
 
         Raises:
-            ClosedError: Once the drone is closed, and from :meth:`bar` on.
+            ClosedError: If the drone is closed, or after :meth:`bar`.
             UnsupportedError: If neither the vehicle nor its proxy supports it.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
-                with ``now`` also while the authority is still awaited.
+                with ``now``, also if the request for the authority has not been answered yet.
             RefusedError: If an emergency stop blocks a one-off action, or any action with ``now``.
             LinkError: With ``now`` while the link is down.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
-            # A new series of set-points starts after any other command: an earlier refusal says nothing about it.
+            # After any other command, a new series of set-points begins, to which an earlier refusal does not apply.
             self._first_set_point = 0
             return sent
         told = self.told
@@ -206,7 +206,7 @@ class CommandSender:
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+        """Make ``action`` the newest set-point like :meth:`command`, and return the number of the intent.
 
         :meth:`outcome` returns its outcome. ``again`` is the intent that it repeats under a new number; if another
         command has been given since, nothing is sent and the number stays the same.
@@ -277,7 +277,7 @@ class CommandSender:
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
-        """Clear the set-point, so that it is not sent later."""
+        """Clear the set-point so that it is not sent later."""
         with self._lock:
             self.schedule.clear(Fate.WITHDRAWN)
 
@@ -322,8 +322,8 @@ class CommandSender:
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that requests the authority; an answer that is too late has no effect.
 
-        With ``wait``, returns once the proxy has it, or raises :class:`RefusedError` if the authority is no longer
-        held, or :class:`LinkError`.
+        With ``wait``, returns once the proxy has the answer. Raises :class:`RefusedError` if the authority is no longer
+        held, and :class:`LinkError` if the link fails.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -332,7 +332,7 @@ class CommandSender:
             raise RefusedError(reply.message, code=reply.code.value)
 
     def release(self, *, wait: bool = True) -> None:
-        """Release the authority, or leave the queue. Does nothing if it is neither held nor requested.
+        """Release the authority, or leave the queue. Does nothing if the authority is neither held nor requested.
 
         With ``wait``, raises :class:`NoAnswerError` if the proxy does not answer.
         """
@@ -386,7 +386,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send everything due; return the latest time of the next call, on this process's clock [ns]."""
+        """Send everything that is due; return the deadline of the next call, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
             authority, schedule, present = self._authority, self.schedule, self.is_present(now_ns)
@@ -451,7 +451,7 @@ class CommandSender:
             elif isinstance(answer, Refused):
                 self._refusal = answer
                 changed = self._authority.given_back()
-            else:  # there was no answer, so the next tick requests it again
+            else:  # no answer arrived, so the next tick sends the request again
                 self._authority.pending = False
                 changed = False
         if changed:

@@ -35,7 +35,7 @@ NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
 _OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output of the child before checking on it
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long the child waits for its vehicle to land
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: maximum time for which the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
 P = ParamSpec("P")
@@ -62,7 +62,7 @@ class Network:
 
 
 class NetworkSettings(Protocol):
-    """Settings that only their :class:`NetworkTransport` creates and interprets."""
+    """Settings created and interpreted only by their own :class:`NetworkTransport`."""
 
     @property
     def reach(self) -> str:
@@ -127,8 +127,8 @@ def connect(
     """Connect to a drone.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
-    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
-    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
+    60 s, it returns even so, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -222,7 +222,7 @@ class Connector(Protocol):
         """The target for other processes to reach the same vehicle; None if they can't."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``."""
+        """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``."""
 
     def close(self) -> None:
         """Stop everything started. Idempotent."""
@@ -231,12 +231,12 @@ class Connector(Protocol):
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends. Before that, it lands a vehicle that is
-    still flying for us. Ctrl-C reaches only the application, which can then land.
+    The child ends on :meth:`close` and whenever this process ends, but first lands a vehicle that is still flying for
+    it. Ctrl-C reaches only the application, which can then land.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child; ``command`` is its command line without the address."""
+        """Start the child; ``command`` is its command line, to which the address is added."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name

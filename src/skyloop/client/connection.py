@@ -27,7 +27,7 @@ _log = logging.getLogger("skyloop")
 
 @dataclass(frozen=True, slots=True)
 class RedialPolicy:
-    """Policy for reconnecting to a lost proxy: attempts never end, and the pauses between them grow [s]."""
+    """Policy for reconnecting to a lost proxy: retry forever, with increasing pauses [s]."""
 
     first_s: float = 0.02
     factor: float = 2.0
@@ -47,7 +47,7 @@ class _EndedError(LinkError):
 class ProxyConnection:
     """Sends an application's packets and requests through the current session with the proxy. Thread-safe.
 
-    It is created before all its users; a :class:`ConnectionSupervisor` creates the sessions.
+    It is created before everything that uses it; a :class:`ConnectionSupervisor` creates the sessions.
     """
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
@@ -79,7 +79,7 @@ class ProxyConnection:
 
     @property
     def missing(self) -> int:
-        """Number of feedback samples missing in all sessions, judged by gaps in their numbers."""
+        """Number of feedback samples missing in all sessions, inferred from gaps in their sequence numbers."""
         session = self.session
         return self._missing_before + (0 if session is None else session.monitor.missing)
 
@@ -91,7 +91,7 @@ class ProxyConnection:
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive in the requested form; within one host, they arrive unchanged."""
+        """Whether frames arrive as requested; within one host, they arrive unchanged."""
         session = self.session
         return session is not None and session.variants
 
@@ -123,7 +123,7 @@ class ProxyConnection:
             raise UsageError("an inline callback can't wait for packets that it would itself have to receive")
 
     def poke(self) -> None:
-        """Wake the supervisor to attend to the connection now."""
+        """Wake the supervisor so that it attends to the connection now."""
         self.poked = True
         self.woken.notify()
 
@@ -244,9 +244,9 @@ class ConnectionSupervisor:
         clock: Clock = time.monotonic_ns,
         begin: Callable[[ConnectionSupervisor], None] | None = None,
     ) -> None:
-        """Prepare to connect; :meth:`start` connects.
+        """Prepare to connect; :meth:`start` makes the connection.
 
-        ``begin`` arranges for :meth:`attend` to be called from the first session on; if None, a thread calls it.
+        ``begin`` arranges calls of :meth:`attend` from the first session on; if None, a separate thread makes them.
         """
         self.connection = connection
         self._handler = handler
@@ -259,7 +259,7 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Connect for the first time, within ``timeout_s``, and stay connected from then on.
+        """Make the first connection, within ``timeout_s``, and stay connected from then on.
 
         Raises :class:`NoAnswerError` if the proxy does not answer Hello, :class:`RefusedError` if it refuses the
         connection, and the dialer's errors.
@@ -285,12 +285,12 @@ class ConnectionSupervisor:
         self.connection.poke()
         started, me = self._thread.ident, threading.get_ident()
         if started not in (None, me) and not self.connection.receiving:
-            self._thread.join()  # unless called from an inline callback or from the thread itself
+            self._thread.join()  # except when called from an inline callback or from the thread itself
         self._drop(ClosedError("this drone was closed"), "closed by the application")
         self._set_state(LinkState.CLOSED, "closed by the application")
 
     def attend_for_ever(self) -> None:
-        """Attend to the connection in a separate thread until :meth:`close`."""
+        """Maintain the connection on a separate thread until :meth:`close`."""
         self._thread.start()
 
     def attend(self) -> float:
@@ -432,12 +432,12 @@ def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
 
 
 class Scheduler:
-    """Provides a drone's time: here real time, in which waits sleep and a slow application misses samples.
+    """Provides a drone's time. Here it is real time: waits sleep, and an application that is too slow misses samples.
 
     A replay stepped by its application has a different scheduler, in which waiting advances the time.
     """
 
-    #: Whether callbacks always run on the receiving thread, so that each gets all samples.
+    #: Whether callbacks always run on the receiving thread, so that each receives every sample.
     in_step = False
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:

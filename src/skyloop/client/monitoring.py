@@ -1,4 +1,4 @@
-"""Evaluate a connection by arrival times: the link to the proxy, its clock, and statistics. Pure."""
+"""Evaluate a connection from the arrival times of packets: the link to the proxy, its clock, statistics. Pure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Thresholds:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The monitor's assessment of the arrivals so far."""
+    """The monitor's assessment of the packets received so far."""
 
     state: LinkState
     reason: str
@@ -47,28 +47,28 @@ WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the fra
 
 
 class LinkMonitor:
-    """Monitors one connection. :meth:`verdict` does the work; the other methods only write a few attributes.
+    """Monitors one connection. :meth:`verdict` does the work; the other methods only set a few attributes.
 
     Samples carry consecutive numbers: a gap, minus the samples that the proxy left out to lower the rate, is a loss.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
         self._limits = thresholds
-        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ping
+        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: time without data after which to ping
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
         self._no_gaps_ns = 0  # until then, gaps may result from a changed request
-        self.received_ns = now_ns  #: when any valid packet last arrived
+        self.received_ns = now_ns  #: when the last valid packet arrived
         self.feedback_ns = 0  #: when feedback last arrived; 0 if never
         self.received = 0  #: number of feedback samples received
-        self.missing = 0  #: number of samples missing, judged by gaps in their numbers
+        self.missing = 0  #: number of samples missing, inferred from gaps in their sequence numbers
         self.malformed_count = 0
         self._last_seq: int | None = None
         self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
     def excuse(self, silence_s: float) -> None:
-        """Tolerate this much more silence [s] before the link counts as lost, for networks with pauses."""
+        """Extend the time without data before the link counts as lost by this much [s], for networks with pauses."""
         self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
         self._silent_ns += nanoseconds(silence_s)
 
@@ -141,7 +141,7 @@ class LinkMonitor:
 class StallWatch:
     """Detects that one channel has stalled while others deliver, so that it can be resubscribed.
 
-    After a silence of all channels, the measurement starts over, because this channel may be the last to resume.
+    If all channels have been without data, the measurement starts over, because this channel may be the last to resume.
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
@@ -149,7 +149,7 @@ class StallWatch:
         self._patience_ns = nanoseconds(patience_s)
         self.received_ns = now_ns  #: when this channel last delivered
         self._asked_ns = now_ns
-        self._flow_ns = now_ns  # start of the period in which the others have been delivering
+        self._flow_ns = now_ns  # when the others last resumed delivering
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
         """Return whether to resubscribe now; True at most once in ``patience_s``."""
@@ -176,9 +176,9 @@ class OffsetEstimator:
     """Estimates the offset between two monotonic clocks from round trips.
 
     The proxy wrote its answer between sending and receiving, which bounds the offset regardless of the delay in each
-    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds of a round trip widen over time with
-    the possible drift of the clocks, and the truth lies within the bounds of all round trips (Marzullo and Owicki,
-    "Maintaining the time in a distributed system", 1983).
+    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds from a round trip widen over time with
+    the possible drift of the clocks, and the true offset lies within the bounds of all round trips (Marzullo and
+    Owicki, "Maintaining the time in a distributed system", 1983).
     """
 
     def __init__(self, depth: int = 16, max_drift: float = MAX_DRIFT) -> None:
@@ -231,13 +231,13 @@ class ChannelStats:
     count: int = 0  #: samples received; for commands, commands sent
     rate_hz: float = 0.0  #: samples per second, over the last two seconds
     lost: int = 0  #: missing, judged by gaps in their numbers; for video including those that the proxy left out
-    #: Replaced by newer ones before their consumer took them; for commands, those that the transport did not accept.
+    #: Samples replaced by newer ones before their consumer took them; for commands, those the transport rejected.
     dropped: int = 0
     malformed: int = 0  #: undecodable samples
-    #: From publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
+    #: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
     delay_s: Distribution | None = None
     age_s: float | None = None  #: time since the newest sample's capture
-    uncertainty_s: float = 0.0  #: maximum error of both from comparing two hosts' clocks; 0 on one host
+    uncertainty_s: float = 0.0  #: maximum error of both, from comparing two hosts' clocks; 0 on a single host
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
@@ -288,7 +288,7 @@ class ChannelCounter:
     def stats(
         self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
     ) -> ChannelStats:
-        """Return the statistics at ``now_ns``; the arguments are added to the counts here.
+        """Return the statistics at ``now_ns``, with the arguments added to the numbers counted here.
 
         ``ages``: whether ``age_s`` is meaningful for this channel.
         """

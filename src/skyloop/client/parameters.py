@@ -36,11 +36,11 @@ _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusa
 
 
 class Restorer:
-    """Rewrites parameters after a restart of the proxy, which loses the application's values.
+    """Writes parameters again after a restart of the proxy, which has lost the values set by the application.
 
-    It rewrites only values, never momentary parameters, and only if no other application can have written since: a
-    lost link alone changes nothing at the proxy, and other pilots' newer values stay. Each run of the proxy numbers its
-    leases from 1, so a gap between two of ours means that another application held the authority and may have written.
+    It rewrites only lasting values, never momentary parameters, and only if no other application can have written:
+    losing the link changes nothing at the proxy, and other pilots' newer values are kept. A proxy numbers its leases
+    from 1, so a gap between two of ours means that another application held the authority and may have written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
@@ -105,8 +105,8 @@ class Config(Mapping[str, Value]):
 
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
     restarted proxy forgets written values; they are rewritten with the next grant of the authority, unless another
-    application held it in between. Momentary parameters, such as a flip, never are. Every method waits for the proxy's
-    answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    application held it in between. Momentary parameters, such as a flip, are never rewritten. Every method waits for
+    the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:

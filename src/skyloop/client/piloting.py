@@ -1,4 +1,4 @@
-"""How an application pilots its vehicle: it waits for commands, lets the vehicle go, and ends the flight."""
+"""How an application pilots its vehicle: waiting for commands to complete, giving up control, and ending the flight."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OnExit = Literal["land", "hover"]
 STOP_S: Final = 2.0  #: how long closing waits for the vehicle to report an emergency stop [s]
 LANDING_S: Final = 20.0  #: how long to wait for a landing [s]
 OTHERS_S: Final = 1.0  #: time for feedback to show which application took a vehicle whose landing was refused [s]
-RETURN_S: Final = 180.0  #: how long to wait for a return that the proxy started [s]
+RETURN_S: Final = 180.0  #: how long to wait for a return flight that the proxy started [s]
 AGAIN_NS: Final = 500_000_000  #: interval between attempts at a take-off that is not possible yet [ns]
 #: If the proxy reports no outcome, feedback received sooner than this after a command may predate it [ns].
 _STALE_NS: Final = 100_000_000
@@ -93,7 +93,7 @@ class Piloting:
         *,
         automatic: bool = False,
     ) -> None:
-        """Send the command and, with ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`.
+        """Send the command and, with ``wait``, wait until feedback shows that it is complete; see :meth:`Drone.land`.
 
         If a take-off is not done in time, let the vehicle go. Do so too if the caller stops waiting, for example
         after Ctrl-C, unless it was waiting for a landing.
@@ -127,7 +127,7 @@ class Piloting:
             self.commands.bar()
             try:  # not a daemon: the interpreter must wait for the landing
                 threading.Thread(target=self.end_flight, name="skyloop-end").start()
-            except RuntimeError:  # no thread is available, and this one may not wait
+            except RuntimeError:  # no thread can be started, and this one may not wait
                 self.let_go(f"{where} ended the program", land=True)
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
@@ -135,7 +135,7 @@ class Piloting:
 
         As no person decided it, the vehicle is left alone, here and by the proxy, if others fly it, if it is landing or
         returning, or if the application itself has landed or stopped it. A take-off without visible effect is
-        cancelled. With ``land``, it lands rather than hovers. Returns whether anything was sent.
+        cancelled. If ``land`` is True, it lands instead of hovering. Returns whether anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -199,7 +199,7 @@ class Piloting:
         except RefusedError as error:
             if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
                 return error
-            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that has just taken it
+            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that has just taken over
         except SkyloopError as error:
             return error
         return None
@@ -214,7 +214,7 @@ class Piloting:
         return self.closed or newest is None or newest.state in _ENDED_IN
 
     def _others_hands(self) -> str:
-        """Return who has taken the vehicle from this application; empty if no one has."""
+        """Return a text about who has taken over the vehicle from this application; empty if no one has."""
         status, newest = self.commands.status, self._state.newest
         if status.state in ("queued", "preempted"):
             return f"{status.holder or 'another application'} took over"
@@ -224,7 +224,7 @@ class Piloting:
         """Return whether this application has the vehicle in the air, or has just commanded a take-off."""
         newest = self._state.newest
         if self._state.status.vehicle is LinkState.CLOSED:
-            return False  # a recording that has ended has nothing to land
+            return False  # a recording that has ended has no vehicle to land
         airborne = newest is not None and newest.state.airborne
         if newest is not None and newest.others:
             return False  # others fly it, too: we must not land or stop it
@@ -257,7 +257,7 @@ class ActionWait:
         self._flew = False  # whether it has been in the air since
         self._refused, self._refused_ns = 0, 0  # our newest intent that was not possible yet; its first refusal
         self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle from whoever flies it now, or at the first time that it can be sent.
+        # The call may take the vehicle from its pilot at present, or at the time when the call can first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = commands.ask(action, automatic=automatic)
 
@@ -284,7 +284,7 @@ class ActionWait:
             raise self._problem
 
     def _over(self) -> bool:
-        """Return whether the action is done, or waiting longer would be pointless."""
+        """Return whether the action is done or there is no point in waiting any longer."""
         if type(self._action) is Land and self._done():  # whoever landed it
             return True
         self._problem = self._why_not()
@@ -304,7 +304,7 @@ class ActionWait:
         if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
             return False
         if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
-            return outcome.over  # already on the ground, but a take-off may still have been in transit
+            return outcome.over  # the vehicle is already on the ground, but a take-off may still have been in transit
         return True
 
     def _why_not(self) -> Exception | None:
@@ -348,8 +348,8 @@ class ActionWait:
             now_ns, newest = self._state.scheduler.clock(), self._state.newest
             if self._refused != self._intent:
                 self._refused, self._refused_ns = self._intent, now_ns
-            # Its withdrawal first appears as a landing, which would end another take-off. A vehicle that is still
-            # starting up can only refuse, so the request is repeated afterwards.
+            # The withdrawn take-off first appears as a landing, which would end another take-off. A vehicle that is
+            # still starting up can only refuse, so the request is repeated afterwards.
             stands = newest is not None and not newest.state.airborne and not newest.waking_up
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
@@ -361,18 +361,18 @@ class ActionWait:
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
-            if rose or not self._commands.may_ask:  # once risen, it hovers in the end and the take-off is done
+            if rose or not self._commands.may_ask:  # having left the ground, it will end up hovering
                 return None
             text = f"takeoff was ended because {ENDINGS[outcome.fate]}: take off again"
             return RefusedError(text, code=Refusal.NOT_FRESH)
         return _refused(outcome)
 
     def _called_off(self) -> bool:
-        """Return whether another command by the application ends the take-off, before or after it has started."""
+        """Return whether another command by the application cancels the take-off, whether or not it has started."""
         commands, newest = self._commands, self._state.newest
         if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
             return True
-        # A hover or idle ends a take-off without visible effect: if the vehicle is still on the ground, it is over.
+        # A hover or idle cancels a take-off without visible effect: if the vehicle is still on the ground, it is over.
         stayed, told = commands.latest(Hover, Idle), commands.told
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed
@@ -381,8 +381,8 @@ class ActionWait:
         """Return why waiting is pointless. Old commands aren't resent, but the caller still awaits this landing."""
         if outcome.fate in OVERRULED:
             if self._commands.may_ask:
-                # The caller still wants to land, but a pilot who has since taken over by hand keeps the vehicle. This
-                # is not visible while the application's own link is lost.
+                # The caller still wants to land, but if a pilot has since taken over by hand, that pilot keeps the
+                # vehicle. A takeover is not visible while the application's own link is lost.
                 taken = self._may_be_sent and self._others_now not in (None, self._others)
                 self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
             return None

@@ -25,7 +25,7 @@ STALE_S: Final = 1.0  #: maximum age of current feedback [s]
 STALE_VIDEO_S: Final = 1.0
 CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
 LEVEL_RAD: Final = 0.12  #: maximum tilt of a vehicle that counts as level [rad]
-ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, on vehicles that send one at a time
+ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
 FULL_BYTES: Final = 100_000_000
@@ -59,14 +59,14 @@ class PreflightState:
     capabilities: Capabilities
     feedback: Feedback | None = None  #: the newest sample; None if there is none yet
     feedback_age_s: float | None = None
-    #: Age of each camera's newest picture; None: none arrived in time.
+    #: Age of each camera's newest frame; None if none arrived in time.
     video_age_s: Mapping[str, float | None] = field(default_factory=dict)
     parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty: they were not read
     clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
     app_id: int = 0  #: this application's number in this run of the proxy
     free_bytes: int | None = None  #: free space of the disk for recordings; None: not requested
     video_waited_s: float = 0.0  #: time spent waiting for pictures
-    name: str = "NAME"  #: the drone's name, for commands in remedies
+    name: str = "NAME"  #: the drone's name, used in the commands that remedies suggest
 
 
 class Inspected(Protocol):
@@ -160,7 +160,7 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
-    # Drivers and the checks above give advice for any drone; with the drone's name, its commands can be copied.
+    # Drivers and the checks above give advice without the drone's name; with it, users can copy the commands.
     return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
@@ -169,7 +169,7 @@ def _ok(check: str, detail: str) -> PreflightFinding:
 
 
 def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
-    """Return a finding with this level; a good one has neither a reason nor a remedy."""
+    """Return a finding at this level; at level OK, it has neither a reason nor a remedy."""
     return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 
@@ -360,7 +360,7 @@ def _video(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return the cameras whose pictures a vehicle sends at present: all, or the selected one."""
+    """Return the cameras whose images a vehicle currently sends: all of them, or the selected one."""
     names = tuple(camera.name for camera in capabilities.cameras)
     chosen = parameters.get(ACTIVE)
     return (chosen,) if isinstance(chosen, str) and chosen in names else names
@@ -408,7 +408,7 @@ def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
-    """Yield the driver's findings."""
+    """Yield the findings of the vehicle's driver."""
     text = state.parameters.get(CHECKUP)
     if not isinstance(text, str) or not text:
         return

@@ -48,7 +48,7 @@ class _Pending:
 
 
 class Requests:
-    """The unanswered requests of one connection. Requests are idempotent, and repeated until answered."""
+    """The unanswered requests of one connection. Requests are idempotent and are repeated until answered."""
 
     def __init__(self, send: Callable[[bytes], bool]) -> None:
         self._send = send
@@ -58,7 +58,7 @@ class Requests:
         self._failed: LinkError | None = None
 
     def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
-        """Send a request, repeat it after ``again_s``, and then every 0.3 s.
+        """Send a request, and repeat it after ``again_s`` and then every 0.3 s until it is answered.
 
         ``done`` is called once: on the receiving thread, on the thread that calls :meth:`tick` or :meth:`fail` or, if
         the connection has already failed, on this one. After ``timeout_s`` it gets a :class:`NoAnswerError`.
@@ -113,21 +113,21 @@ PING_S: Final = 1.0  #: time limit for a ping
 FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock if it differs from ours
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval until there are a few round trips
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval while there have been only a few round trips
 _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
-    """Receives samples on the receiving thread, and changes of the connection on the supervisor's."""
+    """Receives samples on the receiving thread and changes of the connection on the supervisor's thread."""
 
     def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, but sent nothing else yet
     def disconnected(self) -> None: ...
     def link_changed(self, state: LinkState, reason: str) -> None: ...
-    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns when to call it again at the latest [ns]
+    def tick(self, now_ns: int) -> int: ...  #: does everything due; returns the latest time to call it again [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers of the other kinds
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers for all other kinds of samples
 
 
 class ProxySession:
@@ -161,7 +161,7 @@ class ProxySession:
         self.closed_reason: str | None = None  #: why it ended, once it has
         self.receiver = 0  #: identity of the receiving thread
         self.look_ns = 0  #: when the supervisor next evaluates its state
-        self._end = dial(self)  # last, because packets may arrive at once
+        self._end = dial(self)  # must be last, because packets may arrive at once
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
 
@@ -210,7 +210,7 @@ class ProxySession:
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is the one that receives at present."""
+        """Whether the calling thread is currently the one that receives."""
         return self.receiver == threading.get_ident() or self._end.receiving
 
     def subscribe(self, topic: str, on: bool) -> None:
@@ -231,7 +231,7 @@ class ProxySession:
         self._end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
-        """Repeat due requests, and ping the proxy if it is silent or its clock needs measuring."""
+        """Repeat due requests, and ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
         late_ns = self.monitor.late_ns  # silence after which the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
@@ -244,10 +244,10 @@ class ProxySession:
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
-        """Resubscribe to feedback if it has stalled although the proxy answers.
+        """Subscribe to feedback again if none is arriving although the proxy answers.
 
-        If feedback was requested in another form, plain feedback replaces it for the rest of this session: the proxy
-        may be older, or have no room for more forms. Consumers select their samples in any case.
+        If only part of the feedback was requested, plain feedback replaces it for the rest of this session, because the
+            proxy may be older or have no room for more variants. Consumers select their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns
@@ -294,7 +294,7 @@ class ProxySession:
         if type(sample) is Feedback:
             if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
-                if not self._up:  # the first sample wakes the supervisor, which reports that the link is up
+                if not self._up:  # on the first sample, wake the supervisor, which reports that the link is up
                     self._up = True
                     self._poke()
             return

@@ -41,7 +41,7 @@ from skyloop.messages.subscription import PLAIN, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-#: A condition to wait for: a flight state or its name, several of which any will do, or a predicate on feedback.
+#: A condition to wait for: a flight state or its name, several (any of them will do), or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
 
@@ -53,7 +53,7 @@ class LinkStatus:
     application: LinkState  #: hop from application to proxy
     vehicle: LinkState  #: hop from proxy to vehicle, as last reported by the proxy
     reason: str = ""
-    remedy: str = ""  #: what to do about the vehicle's link while it is not up
+    remedy: str = ""  #: what the user can do about the vehicle's link while it is not up
 
 
 class Mailboxes:
@@ -116,14 +116,14 @@ class Mailboxes:
 
 
 class FeedbackDemand:
-    """Subscribes to the form of feedback that satisfies all consumers of a drone.
+    """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
     A pilot gets every sample, complete, because they show its link, its authority and failsafes. So does an observer
-    until a consumer limits its request, and whenever a consumer needs them all. A connection has one form at a time.
+    until a consumer limits its request, and whenever a consumer needs them all. A connection has one at a time.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription never changes."""
+        """Subscribe to every sample; with ``whole``, the subscription stays like this."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
@@ -151,7 +151,7 @@ class FeedbackDemand:
 
     @contextmanager
     def wanted(self, request: FeedbackRequest) -> Iterator[None]:
-        """Add a request during the block."""
+        """Keep a request in effect during the block."""
         self.want(request, True)
         try:
             yield
@@ -165,7 +165,7 @@ class FeedbackDemand:
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # before unsubscribing, so that no sample is missed
+            self._connection.subscribe(needed.topic, True)  # subscribe first, so that no sample is missed
             self._connection.subscribe(before.topic, False)
 
 
@@ -193,7 +193,7 @@ class ClientState:
         self.app = app
         self.scheduler = scheduler
         self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
-        self.to_close: list[Callable[[], None]] = []  #: end resources that end with the drone
+        self.to_close: list[Callable[[], None]] = []  #: functions that release resources when the drone is closed
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback arrived, on our clock
@@ -220,7 +220,7 @@ class ClientState:
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
-        self._making = threading.RLock()  # so that two threads that request the same channel get the same one
+        self._making = threading.RLock()  # so that two threads requesting the same channel get the same object
 
     @property
     def name(self) -> str:
@@ -232,7 +232,7 @@ class ClientState:
         return self.scheduler.sample_notifier(self._connection)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
-        """Return the channel found by ``find``, even after the proxy restarts with other cameras."""
+        """Return the channel that ``find`` returns, and follow it when the proxy restarts with other cameras."""
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
@@ -250,7 +250,7 @@ class ClientState:
             self.listeners.remove(listener)
 
     def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
-        """Return the error for a missing frame, with the known reason."""
+        """Return the error for a missing frame, with the reason if it is known."""
         link = self.status
         words = [f"no frame of {camera} arrived within {timeout_s:g} s"]
         if link.vehicle is not LinkState.UP:
@@ -313,7 +313,7 @@ class ClientState:
 class SessionSamples:
     """Handles the samples and changes of the connection in every session.
 
-    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, the rest on the supervisor's.
+    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, all else on the supervisor's.
     """
 
     def __init__(
@@ -399,7 +399,7 @@ class SessionSamples:
         self._state.notifier.notify()
 
     def _applied(self, applied: Applied, now_ns: int) -> None:
-        """Publish the echo of a command, and measure the delay of this application's own."""
+        """Publish the echo of a command; if the command is this application's own, measure its delay."""
         if applied.app_id == self._commands.app_id:
             self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
         self._state.on_command.publish(applied)
@@ -414,7 +414,7 @@ class SessionSamples:
 
 
 def _link_reason(events: Sequence[Event]) -> str:
-    """Return the reason in the newest event about the vehicle's link; empty if there is none."""
+    """Return the reason given in the newest event about the vehicle's link; empty if there has been no such event."""
     found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
     return next((str(event.data.get("reason", "")) or event.text for event in found), "")
 
@@ -424,7 +424,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition and its readable name; :class:`UnknownNameError` for an unknown state."""
+    """Return the predicate for a condition, and its readable name. Raises :class:`UnknownNameError`."""
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")
         return wanted, "as wanted" if name == "<lambda>" else name

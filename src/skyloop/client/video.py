@@ -26,7 +26,7 @@ from skyloop.transport.base import Pixels, stream, video
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-#: Maximum number of pictures that wait for decoding; if decoding is slower, they are skipped up to a key picture.
+#: Maximum number of frames waiting to be decoded; if decoding is slower, skip to the next key frame.
 MOST_WAITING: Final = 6
 IDLE_KEPT: Final = 32  #: maximum number of channels kept of each kind; beyond it, unread ones are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before requesting it again
@@ -57,7 +57,7 @@ class StreamOptions(TypedDict, total=False):
     kbit_s: int | None  #: rate at which the proxy encodes, once for all clients with the same request [kbit/s]
     max_fps: float | None  #: maximum pictures per second; None: all
     scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: the only subscriber that the proxy encodes for, at the rate that its path can carry
+    subscriber: str  #: the only subscriber, to whose path the proxy adapts the rate
 
 
 class VideoChannel(Channel[Arrival]):
@@ -71,7 +71,7 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Create a channel, without consumers, for a request for a camera's frames; None: see :func:`usual`."""
+        """Create a channel, without consumers, for a request for a camera's frames, by default :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
@@ -84,7 +84,7 @@ class VideoChannel(Channel[Arrival]):
         self.too_old = 0  #: number of frames rejected because of a consumer's ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         chosen = self.request.part is not None or self.request.max_fps is not None
-        #: Selects this request's frames from the plain ones; None: all of them.
+        #: Selects the frames for this request from the full stream; None if it includes all of them.
         self.filter = FrameFilter(self.request) if chosen else None
         self._read: Arrival | None = None  # the last result of next_frame()
         self._connection = connection
@@ -113,17 +113,17 @@ class VideoChannel(Channel[Arrival]):
             return None
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame received at ``now_ns``; ignore duplicates and overtaken ones.
+        """Publish a frame received at ``now_ns``, ignoring duplicates and frames that arrive after a newer one.
 
-        ``as_asked``: whether the proxy prepared it for this request; if False, it is scaled here as needed.
+        ``as_asked``: whether the proxy prepared the frame for this request; if not, it is scaled here as needed.
         """
         counter = self.counter
         last = counter.last_seq
         if last is not None and header.seq <= last:
-            return  # a duplicate, or overtaken
+            return  # a duplicate, or older than the newest frame
         offset_ns, scale = self._connection.offset_ns, 1.0 if as_asked else self.request.scale
         arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Consumers come first, then the statistics. The previous frame is released last, because returning its memory
+        # Serve the consumers before the statistics. The previous frame is released last, because returning its memory
         # to the proxy takes longer than everything else here.
         before, self.newest = self.newest, arrival
         self.publish(arrival)
@@ -164,7 +164,7 @@ class StreamChannel(Channel[EncodedFrame]):
         self._asked_ns = -ASK_AGAIN_NS
 
     def receive(self, part: EncodedFrame) -> None:
-        """Handle a received part, on the receiving thread."""
+        """Handle a received part of a frame, on the receiving thread."""
         picture = self._pieces.add(part)
         if picture is None:
             return
@@ -173,7 +173,7 @@ class StreamChannel(Channel[EncodedFrame]):
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Report the newest picture to the proxy, which adapts its rate to the path by these reports. Thread-safe.
+        """Report the newest frame to the proxy, which uses these reports to adapt its rate to the path. Thread-safe.
 
         ``wants_key``: pictures can't be decoded because one is missing; requests are limited to a few a second.
         """
@@ -211,7 +211,7 @@ class StreamDecoder:
         """Queue a picture, on the receiving thread."""
         with self._changed:
             follows = picture.codec == H264 and self._chain.follows(picture.seq, key=picture.key)
-            if picture.key:  # earlier pictures are no longer useful
+            if picture.key:  # earlier frames are no longer needed
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
             elif follows and len(self._waiting) >= MOST_WAITING:
@@ -245,7 +245,7 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False  # pictures that follow a silence still continue the stream, so the decoder stays
+            self._running = False  # frames after a pause still continue the stream, so keep the decoder
             return None
 
     def _leave_out(self) -> None:
@@ -358,7 +358,7 @@ class VideoChannels:
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
-        """Resubscribe to cameras that have stalled while other samples arrive (``flows``)."""
+        """Resubscribe to cameras that have stalled while other samples are arriving (``flows``)."""
         for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)

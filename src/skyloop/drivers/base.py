@@ -81,10 +81,10 @@ class Sink(Protocol):
         """
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera's frames are used at present. If not, a driver need not decode them."""
+        """Return whether this camera's frames are currently used. If not, a driver need not decode them."""
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames per second the most demanding consumer uses at present.
+        """Return the highest rate, in frames per second, at which any consumer currently uses this camera's frames.
 
         0 means none, infinity means all. If frames are expensive, a driver may skip those beyond this rate.
         """
@@ -102,14 +102,14 @@ class Sink(Protocol):
     ) -> None:
         """Publish a picture as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        Size, time and intrinsics are those of the decoded frame. While frames are in use, the decoded frame is also
-        passed to :meth:`frame`.
+        Size, time and intrinsics are the same as those of the decoded frame. While frames are in use, the decoded frame
+        is also passed to :meth:`frame`.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
             data: One undamaged H.264 access unit in Annex B format, from a stream without B pictures. Key pictures
-                include SPS and PPS. Any other picture must continue the previous one passed here: after a gap, or a
-                period without receivers, start with a key picture.
+                include SPS and PPS. Any other picture must continue the one passed before it: after a gap, or after a
+                period without receivers, start with a key frame.
             captured_ns: When the picture was captured, on this host's monotonic clock.
             width: Width [px].
             height: Height [px].
@@ -118,7 +118,7 @@ class Sink(Protocol):
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded pictures have receivers at present."""
+        """Return whether anyone is currently receiving this camera's encoded frames."""
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
         """Report a new state of the vehicle link, or a new reason for the current one.
@@ -126,7 +126,7 @@ class Sink(Protocol):
         Args:
             state: UP once the vehicle answers.
             reason: What is being waited for, and the last failure. Shown to every client.
-            remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
+            remedy: What the user can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
         """
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
@@ -153,7 +153,7 @@ class ServedLink(Protocol):
             readable: Whether :meth:`fileno` is readable; if not, the time last returned has come.
 
         Returns:
-            Latest time of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
+            Deadline of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
         """
 
     def end(self) -> None:
@@ -181,7 +181,7 @@ class ExternalPose:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
     def bounded(self, now_ns: int) -> ExternalPose:
-        """Return the pose with its time limited to the present, as drivers require.
+        """Return the pose with its timestamp limited to the present, as drivers require.
 
         Raises :class:`DriverError` if it is more than 50 ms ahead: the clock is wrong, and all later poses would look
         old.
@@ -228,7 +228,7 @@ class Driver(ABC):
     def capabilities(self) -> Capabilities:
         """Return the vehicle's capabilities.
 
-        May be called before :meth:`open`. The proxy emulates missing actions in software where it can.
+        May be called before :meth:`open`. The proxy emulates missing actions in software where possible.
         """
 
     def parameters(self) -> list[Parameter]:
@@ -239,7 +239,7 @@ class Driver(ABC):
         return []
 
     def set_parameter(self, name: str, value: Value) -> Value:  # noqa: ARG002
-        """Write one parameter and return the value then in force.
+        """Write one parameter and return its new value.
 
         Called on the proxy's request thread; may take up to a second.
 
@@ -298,8 +298,8 @@ class Driver(ABC):
         :meth:`capabilities`, and with finite numbers.
 
         Args:
-            action: A set-point or a one-time action. Without telemetry, a take-off is refused rather than kept for
-                later.
+            action: A set-point or a one-time action. If there is no telemetry, a take-off is refused rather than
+                postponed.
             new: Whether it is a new request from an application. If not, the library repeats or continues an earlier
                 request, which must not take the vehicle back from another controller.
 
@@ -312,7 +312,7 @@ class Driver(ABC):
         return self._apply(action) if new else self._repeat(action)
 
     def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
-        """Refuse a request to the software autopilot that the vehicle would certainly not follow.
+        """Refuse a request to the software autopilot that the vehicle would certainly not obey.
 
         Called before the software autopilot starts an action that the vehicle does not support itself. For example, a
         vehicle that can't be armed refuses the take-off. Returns at once.
@@ -321,7 +321,7 @@ class Driver(ABC):
             action: Take-off, hover, land, velocity or position.
 
         Raises:
-            DriverError: The vehicle would not follow it; the message is shown to people.
+            DriverError: If the vehicle would not obey it; the message is shown to users.
         """
 
     def left_to(self) -> str:
@@ -395,7 +395,7 @@ class Driver(ABC):
         return self._apply(action)
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it differs from a pilot's request."""
+        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it must differ from a pilot's request."""
         return self._apply(action)
 
 

@@ -20,19 +20,19 @@ from skyloop.files import wait_readable
 CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection whose buffer stays full for this long is considered dead
 _READ_BYTES: Final = 65_536  # maximum number of bytes per read
-_BITS_PER_BYTE: Final = 10  # bits on a serial line for each byte, with start and stop bits
+_BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including the start and stop bits
 _DRAIN_S: Final = 0.1  # time limit for closing a connection before a new one is opened
 END_S: Final = 0.5  #: the same for the final close, because TCP resends a lost packet after 0.2 s
-_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection is closed, so that nothing older is delivered
-_OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes still wait this long after their due time
+_UNACKNOWLEDGED_MS: Final = 2500  # unacknowledged data this old end a TCP connection, so they never arrive
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line has stalled if bytes are still unsent this long after their due time
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
-#: Size of the longest frame in MAVLink and MSP [bytes]. Flight controllers' parsers read as many bytes as a frame
-#: announces and don't look for another frame among them, so a frame that may be incomplete is padded before a stop.
+#: Size of the longest frame in MAVLink and MSP [bytes]. A flight controller's parser consumes as many bytes as a frame
+#: announces without looking for another frame in them, so a possibly incomplete frame is padded before a stop is sent.
 _LONGEST: Final = 280
 
 
 class Rank(IntEnum):
-    """Priority of a packet: the first rank is always sent at once, the last only if the line is idle."""
+    """Priority of a packet. The first rank is always sent at once, the last only when the line is idle."""
 
     STOP = 0  #: emergency stops, which empty the output buffer of a serial port
     COMMAND = 1  #: modes and arming, which are rare, small and never held back
@@ -46,27 +46,27 @@ _PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(
 
 
 class LinePace:
-    """Estimates how far a line lags behind, so that packets are fresh on arrival. Pure.
+    """Estimates the backlog of a line, so that packets can be held back rather than arrive late. Pure.
 
     Args:
-        bytes_per_s: Speed of the line; None if it is never a bottleneck.
+        bytes_per_s: Speed of the line; None if the line is never a bottleneck.
         overdue_ns: How late written bytes may be before the line counts as stalled.
     """
 
     def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
-        self._free_ns = 0  # time by which all bytes written will have been sent
+        self._free_ns = 0  # when all bytes written so far will have been sent
         self._written = 0  # total number of bytes written
-        self._mark = 0  # how many of these are due at _due_ns
-        self._due_ns: int | None = None  # time by which they should have been sent; None if none were waiting
+        self._mark = 0  # how many of these should have been sent by _due_ns
+        self._due_ns: int | None = None  # when those bytes should have been sent; None if there were none
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
         """Return whether a packet may be sent now; otherwise it would queue behind others and arrive late."""
         return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
 
     def stalled(self, now_ns: int) -> bool:
-        """Return whether the line is stuck, judging by what is left in the output buffer."""
+        """Return whether the line is stuck, judging by how much is left in the output buffer."""
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
@@ -96,7 +96,7 @@ class ByteStream(ABC):
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
         self.dropped = 0
-        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for written bytes to be sent
+        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for the bytes already written to be sent
         self._pace = pace
         self._clock = clock
         self._stuck_ns = STUCK_NS
@@ -104,7 +104,7 @@ class ByteStream(ABC):
         self._whole = _LONGEST  # number of bytes written since a frame may have been cut
         self._rest = b""  # end of a frame that was only partly written, altered so that the receiver discards it
         self._cleared = False  # a full buffer was emptied for a stop, with no sign yet that it is read again
-        self._after_stop = 1 << 62  # number of bytes written since a stop; if more are waiting, the stop is among them
+        self._after_stop = 1 << 62  # bytes written since a stop; if at most this many are waiting, the stop has left
 
     @abstractmethod
     def fileno(self) -> int:
@@ -238,11 +238,11 @@ class TcpStream(ByteStream):
         self._socket.close()
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # unavailable, or the connection is gone
+        with suppress(Exception):  # the count is unavailable, or the connection is gone
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone, as unreceived bytes would still be counted
+            self._socket.getpeername()  # raises if the connection is gone, when lost bytes would still be counted
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -304,6 +304,6 @@ class SerialStream(ByteStream):
 
 
 def line_speed(path: str, baud: int) -> float | None:
-    """Return a serial port's speed in bytes per second; None for USB, where the bit rate is meaningless."""
+    """Return a serial port's speed in bytes per second; None for USB ports, whose bit rate is meaningless."""
     device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS_PER_BYTE

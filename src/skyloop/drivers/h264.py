@@ -1,4 +1,4 @@
-"""Just enough of H.264 to separate pictures, and to detect missing, reordered or resized ones. Pure.
+"""The parts of H.264 needed to separate frames and to detect missing, reordered or resized ones. Pure.
 
 ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annex B, Annex E.
 """
@@ -13,7 +13,7 @@ from skyloop.errors import DecodeError
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
-MAX_SETS: Final = 8  #: maximum number of parameter sets stored of each kind; cameras send one
+MAX_SETS: Final = 8  #: maximum number of parameter sets of each kind to store; cameras send one
 _ANY_START: Final = re.compile(rb"\x00\x00\x01")
 _HEADER_BYTES: Final = 32  # enough for the start of a slice header
 _SET_BYTES: Final = 512  # enough for a sequence parameter set, including scaling lists
@@ -38,17 +38,17 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """The start of a slice header."""
+    """The fields at the start of a slice header."""
 
     is_key: bool
     is_first: bool  #: whether it is the first slice of its picture
     is_reference: bool
     frame_number: int
-    is_b: bool = False  #: whether it may refer to later pictures
+    is_b: bool = False  #: whether it may refer to later frames
 
 
 def units(stream: bytes) -> list[bytes]:
-    """Return the NAL units in stream data in Annex B format. Bytes before the first start code are skipped."""
+    """Split stream data in Annex B format into its NAL units. Bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -118,7 +118,7 @@ def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """Skip the fields for the picture order count, which has three types."""
+    """Skip the fields of the picture order count, of which there are three types."""
     kind = bits.exp_golomb()
     if kind == 0:
         bits.exp_golomb()
@@ -167,7 +167,7 @@ class _Bits:
 class Unit:
     """An access unit with the inspector's findings."""
 
-    data: bytes  #: the unit in Annex B format; a key picture includes its parameter sets
+    data: bytes  #: the unit in Annex B format; if it is a key frame, it includes the parameter sets
     is_key: bool  #: whether decoding can start here: it is an IDR picture with known parameter sets
     after_gap: bool  #: whether pictures are missing before this one, or it is the first
     width: int  #: width [px]
@@ -179,7 +179,7 @@ class Inspector:
     """Inspects the access units of one stream in order, without decoding them.
 
     It remembers parameter sets, which a stream may send only once, and puts them in front of each key picture. If a
-    stream has several sequence parameter sets, the last one counts.
+    stream has several sequence parameter sets, the last one is used.
 
     Args:
         parameters: Parameter sets from outside the stream (SDP or a container), in Annex B format.
@@ -195,8 +195,8 @@ class Inspector:
     def inspect(self, data: bytes) -> Unit | None:
         """Inspect the next access unit, in Annex B format.
 
-        Returns None if it holds no picture, or if its headers are damaged or unknown; then the next unit is marked as
-        following a gap.
+        Returns None if the unit holds no picture, or if its headers are damaged or unknown; the unit after it is then
+        marked as following a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}
@@ -243,7 +243,7 @@ class Inspector:
             try:
                 sequence = parse_sequence(unit)
             except DecodeError:
-                return  # the set is damaged, so the previous one stays in use and the decoder decides
+                return  # the parameter set is damaged; keep the previous one and leave it to the decoder
             if sequence != self._sequence:
                 self._sequence, self._before = sequence, None
                 for known in self._sets.values():

@@ -1,4 +1,4 @@
-"""A network camera or a camera device of this machine: its options in a vehicle's address, and its live video.
+"""A network camera, or a camera device of this machine: its options in a vehicle's address, and its live video.
 
 The video source is the address of a stream, or a device; FFmpeg opens it. The intrinsics are given by ``calibration``,
 the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1,
@@ -28,7 +28,7 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 if TYPE_CHECKING:
     from skyloop.drivers.live_container import ContainerStream
 
-STALLED_S: Final = 1.5  #: a stream that is silent for this long, or for three of its periods, is reopened
+STALLED_S: Final = 1.5  #: a stream that delivers nothing for this long, or for three of its periods, is reopened
 _WHERE: Final = "camera"  # source of the events
 OPEN_S: Final = 5.0  #: time limit for connecting, the handshake and the first picture
 DEVICE_FORMAT: Final = "v4l2"
@@ -55,10 +55,10 @@ _LISTENING: Final = frozenset({"udp", "rtp"})
 class CameraSource:
     """A video source for FFmpeg, with its options."""
 
-    name: str = field(repr=False)  #: address or path, with its secrets
+    name: str = field(repr=False)  #: address or path, including its secrets
     scheme: str  #: scheme of the address; empty for a device
     options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's options
-    sdp: str = ""  #: session description (RFC 4566), if there is no server to provide it
+    sdp: str = ""  #: session description (RFC 4566), if no server provides it
     fallback: Mapping[str, str] | None = None  #: options to retry with if the server refuses the first protocol
     loses: bool = False  #: whether parts of pictures may get lost unnoticed
 
@@ -138,8 +138,8 @@ def check_intrinsics(uri: VehicleUri) -> None:
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
     """Return the intrinsics in an address for frames of the given size [px].
 
-    None unless the address gives the focal length, or a calibration for this aspect ratio. Raises :class:`UsageError`
-    if an option makes no sense, options contradict each other, or the calibration can't be read.
+    Returns None unless the address gives the focal length, or a calibration for this aspect ratio. Raises
+    :class:`UsageError` if an option makes no sense, options contradict each other, or the calibration can't be read.
     """
     if "calibration" in uri.options:
         calibration = _calibration(uri)
@@ -178,7 +178,7 @@ def _distortion(uri: VehicleUri) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class LiveCameraSettings:
-    """A camera's settings. Size and rate are announced before the first picture, and requested from a device."""
+    """A camera's settings. Size and rate are announced before the first frame, and are requested from a device."""
 
     source: CameraSource
     name: str

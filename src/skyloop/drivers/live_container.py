@@ -1,6 +1,6 @@
 """Live video through PyAV, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
 
-All errors while opening and reading are OSErrors with a readable reason.
+All errors during opening and reading are OSErrors with a readable reason.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-HOPELESS_S: Final = 3.0  #: time without a decodable picture after which this is reported
+HOPELESS_S: Final = 3.0  #: time without a decodable frame after which this is reported
 STRICT_S: Final = 15.0  #: time without undamaged H.264 after which damage is tolerated
 #: Number of pictures that FFmpeg holds back: it detects the end of a picture only when the next one starts, and the
 #: packets of a transport stream add the same delay again.
 _HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
 _REORDERED_NS: Final = 1_000_000_000  # timestamps step back by less for B pictures, by more if a clock is set back
-_STAMPS: Final = 128  # number of capture times stored: two per picture, more than any decoder holds back
+_STAMPS: Final = 128  # maximum number of capture times stored: two per frame, more than any decoder holds back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 
 
@@ -46,7 +46,7 @@ class ProtocolRefusedError(ConnectionError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A picture's bytes, with everything needed for decoding and timing."""
+    """The bytes of an encoded frame, with everything needed for decoding and timing."""
 
     packet: av.Packet[av.VideoStream]
     context: VideoCodecContext  # codec context of its connection
@@ -75,7 +75,7 @@ class ContainerStream:
         OSError: The source can't be opened, or has no supported video.
     """
 
-    broken = 0  # FFmpeg does not report discarded pictures
+    broken = 0  # FFmpeg does not report the frames it discards
     lost_bytes = 0
 
     def __init__(
@@ -112,7 +112,7 @@ class ContainerStream:
             self._container.close()
             raise
         held_back = _HELD_BACK.get(self._container.format.name, 0)
-        self._arrivals: deque[int] = deque(maxlen=held_back + 1)  # arrival times of the latest pictures from FFmpeg
+        self._arrivals: deque[int] = deque(maxlen=held_back + 1)  # arrival times of the latest frames from FFmpeg
         self._number = 0
         self._live_clock = LiveClock()
         self._newest_ns: int | None = None  # newest timestamp
@@ -159,7 +159,7 @@ class ContainerStream:
         return context, self._container.demux(videos[0])
 
     def _captured_ns(self, packet: av.Packet[av.VideoStream]) -> int:
-        """Return a picture's capture time, from its timestamp and the smallest recent delay, or else its arrival."""
+        """Return a frame's capture time, from its timestamp and the smallest recent delay, or else its arrival time."""
         stamp_ns = _stamp_ns(packet)
         if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
             return self._arrivals[0]
@@ -175,7 +175,7 @@ class ContainerStream:
 class Units:
     """Provides a stream's H.264 in Annex B format, whatever its container.
 
-    ``reason`` says why pictures can't be forwarded undecoded; it is empty while they can.
+    ``reason`` states why frames can't be forwarded without decoding; it is empty while they can.
     """
 
     def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
@@ -184,7 +184,7 @@ class Units:
         self.in_order = self._is_h264  #: whether so far no picture has referred to a later one
         self._filter: av.BitStreamFilterContext | None = None
         parameters = bytes(context.extradata or b"")
-        if self._is_h264 and parameters[:1] == b"\1":  # sizes instead of start codes, as in MP4
+        if self._is_h264 and parameters[:1] == b"\1":  # the stream has sizes instead of start codes, as in MP4
             self._filter, parameters = av.BitStreamFilterContext("h264_mp4toannexb", stream), b""
         self._inspector = Inspector(parameters)
 
@@ -204,7 +204,7 @@ class Units:
     def _annex_b(self, packet: av.Packet[av.VideoStream]) -> bytes | None:
         if self._filter is None:
             return bytes(packet)
-        copy = av.Packet(bytes(packet))  # the filter consumes its input
+        copy = av.Packet(bytes(packet))  # pass a copy, because the filter consumes its input
         try:
             return b"".join(bytes(part) for part in self._filter.filter(copy))
         except (av.error.FFmpegError, ValueError):
@@ -236,10 +236,10 @@ class LiveDecoder:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the stream so far, which the next picture does not continue."""
+        """Forget the stream so far, because the next frame does not continue it."""
         self._before: Piece | None = None
-        self._failing_ns: int | None = None  # when pieces began to be undecodable
-        self._barren_since_ns: int | None = None  # when H.264 stopped yielding pictures
+        self._failing_ns: int | None = None  # since when pieces have been undecodable
+        self._barren_since_ns: int | None = None  # since when H.264 data have yielded no frames
         self._strict: VideoCodecContext | None = None  # None while H.264 waits for a key picture
         self._shown_ns = 0  # capture time of the newest picture, before which no later one can have been captured
         self._reorders = False  # whether the decoder holds back pictures that refer to later ones
@@ -275,10 +275,10 @@ class LiveDecoder:
 
     def _decode_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         unit = piece.unit
-        if unit is None:  # it holds only parameters, or noise
+        if unit is None:  # there are only parameters, or noise
             self._note_failure(coded)
             return None
-        surprised = piece.reordered and not self._reorders  # the picture that it refers to would be shown before it
+        surprised = piece.reordered and not self._reorders  # the frame that it refers to would be shown before it
         if not follows or unit.after_gap or surprised:
             self._strict = None
             if self._forgiving is not None:
@@ -321,7 +321,7 @@ class LiveDecoder:
     def _judged(
         self, context: VideoCodecContext, packet: av.Packet[av.VideoStream], coded: Coded
     ) -> av.VideoFrame | None:
-        """Decode a piece; return the picture, or None if there is none that FFmpeg considers good."""
+        """Decode a piece; return the image, or None if it yields none that FFmpeg considers undamaged."""
         try:
             images = context.decode(packet)
         except (av.error.FFmpegError, ValueError):

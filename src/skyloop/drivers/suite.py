@@ -11,7 +11,7 @@ The vehicle at that address must answer and, if it can fly, be on the ground wit
 off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle unless it is tied down or
 in a net.** A vehicle that can't fly is not commanded.
 
-Tests of abilities that the vehicle lacks are skipped. The module does not import pytest.
+Tests of features that the vehicle lacks are skipped. The module does not import pytest.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ __all__ = ["DriverSuite", "RecordingSink"]
 
 APPLY_S: Final = 0.05
 NEAR_RAD: Final = 0.3  #: tolerance for the commanded heading [rad]
-#: Returns how far the vehicle moved between two samples, with its sign; None if the vehicle does not report it.
+#: Function that returns the signed distance the vehicle moved between two samples; None if it is not reported.
 Measure = Callable[[Feedback, Feedback], float | None]
 _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
@@ -76,7 +76,7 @@ class DriverSuite:
 
     uri: ClassVar[str] = ""  #: address of the vehicle to test with
 
-    connect_timeout_s: ClassVar[float] = 5.0  #: how long the link may take to come up [s]; others are limits too
+    connect_timeout_s: ClassVar[float] = 5.0  #: time limit for the link to come up [s]; the next ones are limits, too
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
     takeoff_timeout_s: ClassVar[float] = 15.0
@@ -104,12 +104,12 @@ class DriverSuite:
         """Return a new, unopened driver. By default, its class is found by the entry point for the URI's scheme.
 
         Args:
-            uri: The address of the vehicle to test with, perhaps with an option that must be refused.
+            uri: The address of the vehicle to test with; it may include an option that must be refused.
         """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Make the vehicle disappear for the open driver: switch off its radio, or stop its emulator.
+        """Make the vehicle that the open driver uses disappear: switch off its radio, or stop its emulator.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -158,7 +158,7 @@ class DriverSuite:
     # Before opening ------------------------------------------------------------------------------------------------
 
     def test_constructor_does_no_io(self) -> None:
-        """A constructor starts no thread and opens no descriptor, and close() without open() does nothing."""
+        """The constructor starts no threads and opens no descriptors, and close() without open() does nothing."""
         self.new_driver()  # fill import caches first, because they are not the driver's resources
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
@@ -260,7 +260,7 @@ class DriverSuite:
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
-        """Frames arrive, are recent, and have the names and sizes of the announced cameras."""
+        """Frames arrive, are recent, and match the announced cameras in name and size."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
@@ -280,7 +280,7 @@ class DriverSuite:
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
-        """Encoded pictures arrive, and have the names and sizes of the announced cameras."""
+        """Encoded frames arrive, and match the announced cameras in name and size."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
@@ -296,7 +296,7 @@ class DriverSuite:
             )
 
     def test_link_lost_and_found(self) -> None:
-        """The link is reported LOST with a reason when the vehicle disappears, and UP when it is back."""
+        """The link is reported as LOST with a reason when the vehicle disappears, and as UP when it returns."""
         with self.opened() as (_, sink):
             self.wait_for_feedback(sink)
             self.vehicle_disappears()
@@ -314,7 +314,7 @@ class DriverSuite:
     def test_apply_returns_what_was_applied_at_once(self) -> None:
         """``apply`` returns a finite action within :data:`APPLY_S`.
 
-        Runs on the ground, with actions that do not take off; flying has its own test.
+        Runs on the ground, using actions that do not take off; flight has its own test.
         """
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
@@ -337,7 +337,7 @@ class DriverSuite:
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
-        """On the ground, a repeated action does the same as a new one while nothing else commands the vehicle."""
+        """On the ground, repeating an action has the same effect as a new one if nothing else commands the vehicle."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
@@ -380,7 +380,7 @@ class DriverSuite:
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             end = time.monotonic() + self.feedback_timeout_s
-            while not (writable := self._writable(driver)):  # a driver may need to request them first
+            while not (writable := self._writable(driver)):  # a driver may have to request the parameters first
                 if time.monotonic() > end:
                     raise unittest.SkipTest(f"parameters() lists no writable one within {self.feedback_timeout_s} s")
                 time.sleep(0.05)
@@ -413,7 +413,7 @@ class DriverSuite:
     # Flight --------------------------------------------------------------------------------------------------------
 
     def test_flight(self) -> None:
-        """The vehicle takes off, moves both ways along each axis with the right sign, and lands.
+        """The vehicle takes off, moves in both directions along each axis with the right sign, and lands.
 
         If it supports positions, it also flies to some.
         """
@@ -471,7 +471,7 @@ class DriverSuite:
         assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
-        """On the ground, an emergency stop is reported, and ends only with a reset."""
+        """On the ground, an emergency stop is reported, and only a reset ends it."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
@@ -520,9 +520,9 @@ def _check_rotation(name: str, rotation: tuple[float, ...]) -> None:
 
 
 class Flight:
-    """One flight in the suite, with the vehicle's own take-off and landing if it has them, otherwise by set-points.
+    """One flight in the suite, using the vehicle's own take-off and landing if it has them, and set-points otherwise.
 
-    Speeds, distances and time-outs are the suite's. Whatever does not happen in time raises ``AssertionError``.
+    Uses the suite's speeds, distances and time-outs. Raises ``AssertionError`` when one of the latter is exceeded.
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
@@ -565,7 +565,7 @@ class Flight:
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait; a vehicle without its own landing descends until it is landed or below 0.1 m."""
+        """Land and wait; a vehicle without a landing command descends until it is landed or below 0.1 m."""
         if "land" in self.actions:
             self.driver.apply(Land())
             self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
@@ -581,8 +581,8 @@ class Flight:
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
         """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude that goes there.
 
-        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. It is
-        sent only once, because the driver must keep it in force.
+        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. The
+        command is sent only once, because the driver must keep it in force.
         """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
@@ -623,7 +623,7 @@ class Flight:
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not report what is measured for this axis
+            return  # the vehicle does not report the quantity measured for this axis
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -635,7 +635,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Wait until the vehicle is slow again, if it reports its speed, because after an attitude it coasts."""
+        """Wait until a vehicle that reports its speed is slow again, because it coasts after an attitude."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -643,7 +643,7 @@ class Flight:
 
 
 def _summary(feedback: Feedback | None) -> str:
-    """Return the fields that a driver filled in, and their age, for an error message."""
+    """Return the fields that a driver filled in, and the age of the feedback, for an error message."""
     if feedback is None:
         return "none"
     age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9

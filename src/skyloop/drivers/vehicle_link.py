@@ -24,7 +24,7 @@ from skyloop.messages import AnyAction, EventKind, Severity
 
 NAME_WAIT_S: Final = 0.2  #: time that suffices for most name look-ups
 PAUSE_S: Final = 0.03  #: pause after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: how often silent sockets are renewed, as this host's address may have changed
+RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets without data, because this host may have a new address
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: maximum number of datagrams read before commands get their turn
 
@@ -43,7 +43,7 @@ class Readable(Protocol):
 class NameLookup:
     """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
 
-    It handles one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
+    It looks up one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
     that also serves others.
     """
 
@@ -58,7 +58,7 @@ class NameLookup:
         return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for at most ``wait_s``."""
+        """Return a host's first address. Blocks for up to ``wait_s``."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -86,9 +86,9 @@ def _resolve(question: Future[str], host: str, family: socket.AddressFamily) -> 
 class VehicleLink(ABC, Generic[S]):
     """Serves a session in its own thread from :meth:`start` to :meth:`stop`.
 
-    The session makes all decisions while ``lock`` is held; its callbacks run while it is free. A subclass for a kind of
-    vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each socket that
-    it opens to :meth:`_watch`.
+    The session makes all decisions while ``lock`` is held; its callbacks run after the lock is released. A subclass for
+    a kind of vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each
+    socket that it opens to :meth:`_watch`.
 
     Args:
         name: Name of the thread.
@@ -96,7 +96,7 @@ class VehicleLink(ABC, Generic[S]):
         deliver: Called on the link's thread with the session's callbacks for the sink.
         clock: A monotonic clock [ns].
         family: Address family for looking up the host.
-        close_s: How long :meth:`stop` waits for the thread.
+        close_s: How long :meth:`stop` waits for the thread to end.
         serve: Hands the link to a thread that serves several links; None: the link has its own thread.
     """
 
@@ -147,7 +147,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Pass an action to the session, and send it at once if the pace allows; return the result. Thread-safe."""
+        """Pass an action to the session, and send it at once if possible; return the resulting action. Thread-safe."""
         return self._decide(partial(self.session.command, action))
 
     # For methods of subclasses that the proxy's threads call ------------------------------------------------------
@@ -168,7 +168,7 @@ class VehicleLink(ABC, Generic[S]):
     ) -> str | None:
         """Send a request; return the vehicle's answer, or ``otherwise`` if it is late. Not on the link's thread.
 
-        ``ask`` is called with the lock held; its argument is the function that receives the answer.
+        ``ask`` is called with the lock held, and is given the function to call with the answer.
         """
         done = threading.Event()
         answers: list[str | None] = []
@@ -194,14 +194,14 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _close_sockets(self) -> None:
-        """Close the sockets of :meth:`_open_sockets`. With the lock held."""
+        """Close the sockets of :meth:`_open_sockets`. The lock is held."""
 
     @abstractmethod
     def _send_due(self, now_ns: int) -> None:
         """Send everything due. With the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return the time after which sockets are reopened, counted from their opening; None: not in the present state.
+        """Return how long after opening the sockets they are reopened; None: not in the present state.
 
         The default suits UDP: sockets are reopened while nothing is received. Called with the lock held.
         """
@@ -211,7 +211,7 @@ class VehicleLink(ABC, Generic[S]):
         """Do work that has a pace of its own. With the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
-        """Call a function whenever a source is readable, on the link's thread, with the lock free."""
+        """Call a function on the link's thread, without holding the lock, whenever a source is readable."""
         self._selector.register(source, selectors.EVENT_READ, ready)
 
     def _forget(self, source: Readable) -> None:
@@ -242,7 +242,7 @@ class VehicleLink(ABC, Generic[S]):
         try:
             port.send(datagram)
         except BlockingIOError:
-            pass  # it is lost, as any datagram may be
+            pass  # the datagram is lost, as any datagram may be
         except OSError as error:
             self.session.failed(error)
 
@@ -305,7 +305,7 @@ class VehicleLink(ABC, Generic[S]):
         return self._selector.fileno()
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work; see :class:`skyloop.drivers.base.ServedLink`."""
+        """Do all pending work, as described in :class:`skyloop.drivers.base.ServedLink`."""
         if self._stopping.is_set():
             return None
         self._within = threading.get_ident()
@@ -339,7 +339,7 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
 
     RETRY_NS: ClassVar[int]  #: pause between connection attempts
 
-    _silent_ns: int | None = None  # duration of silence after which the connection is reopened; None: never
+    _silent_ns: int | None = None  # the connection is reopened after this long without data; None: never
     _connection: C | None = None
     _broken = False  # whether nothing more can be sent
 
@@ -358,10 +358,10 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
         """
 
     def _on_end(self, connection: C) -> None:
-        """Send everything due before the connection is closed for good. With the lock held."""
+        """Send everything that is due before the connection is closed for good. With the lock held."""
 
     def _on_broken(self, error: OSError, now_ns: int) -> None:
-        """Handle a connection that accepts no more data. With the lock held."""
+        """Handle a connection that no longer accepts data. With the lock held."""
         self._broken = True
         self.session.broken(error, now_ns)
 

@@ -1,6 +1,6 @@
 """What the sessions of all vehicles share: the link's state and its reasons, pending events, the emergency stop.
 
-Pure, except for :func:`serial_trouble`, which inspects the port's device.
+Pure except for :func:`serial_trouble`, which inspects the port's device.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
-REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
-_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors for a port locked by another program
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reports of a reason while nothing is received
+_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors when another program has locked the port
 _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of ports below /dev
 _MAX_LISTED_PORTS: Final = 4  # maximum number of ports listed in a message
 
@@ -63,12 +63,12 @@ class Arrival(Enum):
     """A packet's place in the order, according to its number."""
 
     NEW = auto()
-    LATE = auto()  #: later packets overtook it
+    LATE = auto()  #: packets with higher numbers arrived before it
     RESTARTED = auto()  #: the vehicle has restarted, and counts from the start again
 
 
-RESTART_RUN: Final = 5  #: number of packets with low numbers, in order among themselves, that prove a restart
-RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and the last, which must not be one burst
+RESTART_RUN: Final = 5  #: number of consecutive packets with low, increasing numbers that prove a restart
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and last, to rule out a single burst
 
 
 class RestartWatch:
@@ -88,7 +88,7 @@ class RestartWatch:
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
-        """Classify a packet, which has just arrived, by its number."""
+        """Classify a packet that has just arrived by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
@@ -109,8 +109,8 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: While nothing is received, a request is kept, or sent, for this long after its last repeat. An application that still
-#: wants it keeps repeating it; otherwise it might interfere with another application's flight.
+#: How long after its last repeat a request is kept, or sent, while nothing is received. An application that still wants
+#: it keeps repeating it; otherwise it might interfere with another application's flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
@@ -126,7 +126,7 @@ class VehicleSession(ABC):
 
     def __init__(self, now_ns: int) -> None:
         self.due_ns = now_ns  #: when there will next be something to send
-        self.link_state: LinkState | None = None  #: the state last reported
+        self.link_state: LinkState | None = None  #: the last state reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
         self._received_ns: int | None = None  # when the vehicle was last received; None: not since opening or loss
@@ -138,12 +138,12 @@ class VehicleSession(ABC):
 
     @property
     def is_receiving(self) -> bool:
-        """Whether data from the vehicle are arriving, or were until just now."""
+        """Whether data are arriving from the vehicle, or were until a moment ago."""
         return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action; return what is applied, within the limits. Raises DriverError if that is impossible."""
+        """Accept an action; return what is applied within the limits. Raises DriverError if that is impossible."""
 
     @abstractmethod
     def close(self) -> None:
@@ -195,10 +195,10 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """Drop all state of the lost vehicle, so that everything starts over with its next packet."""
+        """Discard all state of the lost vehicle, so that its next packet starts from scratch."""
 
     def _keep(self, action: AnyAction, now_ns: int) -> None:
-        """Record an accepted action: a landing is kept while nothing is received, but not forever."""
+        """Record an accepted action: a landing is remembered while nothing is received, but not forever."""
         if not isinstance(action, Idle):
             self._landing_ns = now_ns if isinstance(action, Land) else None
 
@@ -268,7 +268,7 @@ class LinkTrouble:
     """Why a vehicle can't be reached."""
 
     reason: str  #: what failed; may be empty
-    remedy: str = ""  #: an instruction for people; may be empty
+    remedy: str = ""  #: an instruction for the user; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
@@ -316,42 +316,42 @@ def _permission(port: str, status: os.stat_result) -> str:
     return f"join the group {group}: sudo usermod -a -G {group} $USER, then log in again"
 
 
-PACE_NS: Final = nanoseconds(0.1)  #: interval between two repeats
+PACE_NS: Final = nanoseconds(0.1)  #: interval between repeats
 GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop not confirmed by the vehicle this long after the press is abandoned
 AGAIN_NS: Final = nanoseconds(0.3)  #: after a pause this long, a request counts as a new press rather than a repeat
-SETTLE_NS: Final = nanoseconds(0.5)  #: reports received sooner than this after the press may predate it
+SETTLE_NS: Final = nanoseconds(0.5)  #: reports that arrive sooner than this after the press may predate it
 
 
 class MotorStop:
     """One emergency stop of any driver, from the press until it is reset or abandoned.
 
     A driver knows how to tell that the motors are off, and which bytes stop them; this decides everything else.
-    While it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not data
-    arrive from the vehicle, and again every 0.1 s until the vehicle confirms it; until then, the vehicle's own state is
-    reported. If the vehicle has not confirmed it 10 s after the press, the stop ends: it must not be sent minutes
-    later, and the vehicle must be free to land. Not thread-safe.
+    While it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not the
+    vehicle is sending data, and again every 0.1 s until the vehicle confirms it; until then, the state reported is the
+    vehicle's own. If the vehicle has not confirmed it 10 s after the press, the stop is abandoned, because it must not
+    be sent minutes later and the vehicle must be free to land. Not thread-safe.
     """
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:
         self._give_up = give_up
         self._begun_ns: int | None = None  # time of the first press
-        self._pressed_ns = 0  # time of the newest press that was not a repeat
+        self._pressed_ns = 0  # time of the newest press, not counting repeats
         self._heard_ns = 0  # time of the newest press, including repeats
         self._sent_ns: int | None = None
         self._shown = self._was_shown = False
 
     @property
     def active(self) -> bool:
-        """Whether it has been pressed, and neither reset nor abandoned since."""
+        """Whether the stop has been pressed and has since been neither reset nor abandoned."""
         return self._begun_ns is not None
 
     @property
     def shown(self) -> bool:
-        """Whether it is active and the vehicle last reported its motors off, so that the state is ``EMERGENCY``."""
+        """Whether the stop is active and the vehicle last reported its motors off; the state is then ``EMERGENCY``."""
         return self.active and self._shown
 
     def press(self, now_ns: int) -> None:
-        """Stop the motors, or keep stopping them. Each press restarts the time limit."""
+        """Stop the motors, or continue to stop them. Each press restarts the time limit."""
         if self._begun_ns is None:
             self._begun_ns, self._sent_ns, self._shown, self._was_shown = now_ns, None, False, False
             self._pressed_ns = now_ns
@@ -364,9 +364,9 @@ class MotorStop:
         return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
-        """Advance an active stop; return whether to send it now. Call it at each tick, even without telemetry.
+        """Advance an active stop; return whether to send it now. Call it at every tick, even if no telemetry arrived.
 
-        ``shown``: whether the vehicle reports that its motors are off; None if there is no new information.
+        ``shown``: whether the vehicle reports that its motors are off; None if it has reported nothing new.
         """
         if self._begun_ns is None:
             return False
@@ -384,7 +384,7 @@ class MotorStop:
         return True
 
     def reset(self) -> None:
-        """Let the motors run again. Does nothing if no stop is active.
+        """Allow the motors to run again. Does nothing if no stop is active.
 
         Raises :class:`DriverError` if the vehicle has not confirmed the stop, which is still being sent.
         """

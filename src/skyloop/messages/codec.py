@@ -26,7 +26,7 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
 
-#: What a packet can hold, in the order of :class:`Kind`.
+#: All types of sample that a packet can hold, in the order of :class:`Kind`.
 Sample = (
     Command
     | Feedback
@@ -97,7 +97,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 
     Raises :class:`DecodeError` if the bytes are not a packet with a valid sample.
     """
-    # One look-up checks signature, version, kind and reserved bytes; only a failure is analysed further.
+    # A single look-up checks signature, version, kind and reserved bytes; only failures are analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
     size = len(packet) - HEADER_SIZE
     if decoder is None or not 0 <= size <= MAX_BODY or _unpack_length(packet, _PREFIX_SIZE)[0] != size:

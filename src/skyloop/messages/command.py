@@ -35,7 +35,7 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def problem(self) -> str:
-        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers are not valid; empty if the vehicle can fly them."""
         return ""
 
 
@@ -183,7 +183,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     seq: Count  #: increases with every packet of a connection
     lease: Count  #: number of the lease it is sent under; 0 if there is none (emergency stop only)
     intent: Count  #: increases with each request by the *application*; the library's repeats keep it
-    sent_ns: int  #: when it was sent, on the proxy's clock; unbounded, because emergency stops are valid at any time
+    sent_ns: int  #: sending time on the proxy's clock; unchecked, because emergency stops are valid at any time
     action: AnyAction
     automatic: bool = (
         False  #: requested by the library, not by a person or a program, and so never takes a vehicle from others
@@ -199,10 +199,10 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: TimeNs
     applied_ns: TimeNs
     asked: AnyAction
-    applied: AnyAction  #: the action after the limits, as the driver applied it
+    applied: AnyAction  #: the action as limited and applied by the driver
 
 
-MAX_OUTCOME_TEXT: Final = 300  #: characters in an outcome's text
+MAX_OUTCOME_TEXT: Final = 300  #: maximum length of an outcome's text [characters]
 
 
 class Fate(StrEnum):
@@ -224,7 +224,7 @@ class Fate(StrEnum):
     JUMPED = "jumped"
 
 
-#: The single list of what can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
+#: The single list of everything that can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
 ENDINGS: Final[dict[Fate, str]] = {
     Fate.COMPLETED: "it was carried out",
     Fate.REFUSED: "it was refused",
@@ -278,7 +278,7 @@ def check_pose(
     position_std_m: float | None = None,
     attitude_std_rad: float | None = None,
 ) -> None:
-    """Check the numbers of a pose: x, y, z [m]; x, y, z, w; standard deviations [m, rad], None if unknown.
+    """Check a pose: position x, y, z [m]; quaternion x, y, z, w; standard deviations [m, rad], None if unknown.
 
     Raises :class:`UsageError` if a number is missing or not finite, a standard deviation is negative, or the
     quaternion's length differs from 1 by more than 0.001.

@@ -48,7 +48,7 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: whether to wait in the queue if another application holds it; False: be refused at once
+    queue: bool = True  #: whether to queue for an authority held by another application; False: be refused
     for_s: Term | None = None  #: how long it is needed after the grant [s]; nil: until it is given back
     takeover: Takeover = Takeover.NOW
 
@@ -90,14 +90,14 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
     """Join the workers of a processor, or remain one: workers repeat this several times a second while they run.
 
-    The answer is :class:`Done`; the worker's share of the frames arrives as a :class:`ProcessorShare`.
+    The answer is :class:`Done`; which of the frames the worker gets is announced by a :class:`ProcessorShare`.
     """
 
     processor: ProcessorName
     code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: identifies the code that all workers of a processor run
     camera: Name
-    shared: bool = True  #: True: each frame goes to one worker; False: every worker gets all frames
-    ready: bool = True  #: False: this worker can't take frames at present, so they go to the others
+    shared: bool = True  #: whether each frame goes to only one worker, rather than to all of them
+    ready: bool = True  #: False: this worker can't take frames at present, so other workers get them
 
 
 class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
@@ -105,7 +105,7 @@ class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
 
     lease: Count  #: the holder's own lease
     app_id: Count  #: number of the application that asked
-    grant: bool  #: hand the authority over now; False: not yet
+    grant: bool  #: whether to hand the authority over now; False: not yet
     reason: Reason = ""  #: human-readable reason for declining
 
 
@@ -159,8 +159,8 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     position: Count  #: 1 is next
     holder: str
     holder_priority: Priority
-    wait_s: float | None = None  #: estimated from the times that the others requested [s]; nil: unknown
-    asked: bool = False  #: whether the holder is being asked to hand it over
+    wait_s: float | None = None  #: estimated from the times for which the others requested it [s]; nil: unknown
+    asked: bool = False  #: whether the holder is being asked to hand over the authority
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
@@ -170,7 +170,7 @@ class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """A page of the parameters; ``total`` is the number of all of them, ``first`` the index of the page's first."""
+    """A page of the parameters; ``total`` is the number of parameters, ``first`` the index of this page's first."""
 
     total: Count
     first: Count

@@ -52,7 +52,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     counter-clockwise from x (ROS REP 103).
     """
 
-    captured_ns: TimeNs  #: time of this state, on the proxy's clock
+    captured_ns: TimeNs  #: time at which the vehicle was in this state, on the proxy's clock
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: remaining charge, 0 to 1
     battery_v: Finite | None = None  #: voltage of the battery [V]
@@ -66,7 +66,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     position_m: Vector | None = None  #: position in world axes [m], if the vehicle knows it
     native: dict[str, Value] | None = None  #: the vehicle's own telemetry, with its own names and units
 
-    seq: Count = 0  #: increases by one with each sample during a run of the proxy
+    seq: Count = 0  #: increases by one with each sample while the proxy runs
     published_ns: TimeNs = 0  #: when the proxy published the sample
     vehicle_link: LinkState = LinkState.CONNECTING  #: state of the hop from proxy to vehicle
     owner: str | None = None  #: name of the application that holds the authority
@@ -80,12 +80,12 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
     skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
-    outcome: Outcome | None = None  #: fate of the newest intent; None: the proxy does not report it
+    outcome: Outcome | None = None  #: result of the newest intent; None: the proxy does not report it
     next_owner: str | None = None  #: name of the first in the queue for the authority; None: the queue is empty
 
     @property
     def waking_up(self) -> bool:
-        """Whether the vehicle has just started and can't take off yet; ``link_reason`` says what it waits for."""
+        """Whether the vehicle has just started and can't take off yet; ``link_reason`` says what it is waiting for."""
         return self.link_reason.startswith(WAKING_UP)
 
     @property
@@ -112,8 +112,8 @@ _KEYS: Final = ("origin.latitude_deg", "origin.longitude_deg", "origin.altitude_
 class EarthOrigin(NamedTuple):
     """The geographic position of the origin of ``Feedback.position_m``, whose axes are x east and y north.
 
-    Autopilots project the earth onto their axes as a sphere. Conversions here use the vehicle's own sphere, so that
-    both agree; with a different sphere, positions would be off by up to 0.6 % of their distance.
+    Autopilots project the earth onto their axes as a sphere. Conversions here use the vehicle's own sphere so that both
+    agree; with a different one, positions would be off by up to 0.6 % of their distance from the origin.
     """
 
     latitude_deg: float  #: latitude [°], north positive
@@ -137,8 +137,8 @@ class EarthOrigin(NamedTuple):
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
         """Return a geographic position in world axes: x east, y north, z up [m].
 
-        Latitude [°] is positive north, longitude [°] east, by the shorter way around the earth; the altitude [m] is
-        above mean sea level.
+        Latitude is positive north [°], and longitude east [°], taking the shorter way around the earth; the altitude
+        [m] is above mean sea level.
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
@@ -166,7 +166,7 @@ class Event(msgspec.Struct, frozen=True, array_like=True):
     text: str
     at_ns: TimeNs  #: time of the event, on the proxy's clock
     severity: Severity = Severity.INFO
-    seq: Count = 0  #: increases by one with each event during a run of the proxy; 0 for the client's own events
+    seq: Count = 0  #: increases by one with each event while the proxy runs; 0 for the client's own events
     app: str | None = None  #: name of the application concerned
     data: dict[str, Value] = msgspec.field(default_factory=dict)
 
@@ -176,7 +176,7 @@ MAX_EVENT_TEXT: Final = 200  #: characters in the last event's text
 
 
 class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
-    """One vehicle's summary. Unknown values are ``None``, as in :class:`Feedback`."""
+    """A summary of one vehicle. Unknown values are ``None``, as in :class:`Feedback`."""
 
     name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of its proxy
     uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: the vehicle's address, truncated if longer
@@ -221,7 +221,7 @@ class OverviewPages:
         self._rows: list[VehicleOverview] = []
 
     def add(self, page: Overview) -> Overview | None:
-        """Add a page; return the whole overview if this was its last page, else None.
+        """Add a page; return the whole overview if this was its last missing page, otherwise None.
 
         An overview with a missing page is dropped: the next one follows within a second.
         """

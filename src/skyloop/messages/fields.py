@@ -1,8 +1,8 @@
 """Types of the fields of samples: bounded numbers and closed vocabularies.
 
 Samples may come from any program that can connect, and their numbers are used as sizes, indices, times and loop bounds.
-Therefore numbers are bounded here, once, on arrival, rather than wherever they are used. Each member of a vocabulary
-equals its own string, so ``state == "hovering"`` works.
+Therefore numbers are bounded here, once, on arrival, rather than wherever they are used. Each enumeration member equals
+its string, so ``state == "hovering"`` works.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 
-#: Three finite numbers, along x, y and z.
+#: Three finite numbers: the components along x, y and z.
 Vector = tuple[Finite, Finite, Finite]
 #: A value of native telemetry, of a parameter or of an event's data.
 Value = bool | int | float | str | tuple[float, ...]
@@ -38,8 +38,8 @@ Value = bool | int | float | str | tuple[float, ...]
 def shape_fits(shape: Sequence[int], count: int, most: int) -> bool:
     """Return whether an array of this shape has ``count`` elements and its axes are not excessively long.
 
-    A zero makes the product of the lengths 0, however large the others are, and a loop over those would never end.
-    Therefore the product with each 0 counted as 1 is at most ``most``.
+    If one length is 0, so is the product of all lengths, however large the others are, and a loop over those would
+    never end. Therefore the product with each 0 counted as 1 is at most ``most``.
     """
     return math.prod(shape) == count and math.prod(max(1, length) for length in shape) <= most
 
@@ -71,15 +71,15 @@ class LinkState(StrEnum):
     UP = "up"
     DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
     LOST = "lost"  #: nothing received past the threshold; reconnecting automatically
-    CLOSED = "closed"  #: closed deliberately; nothing more will arrive
+    CLOSED = "closed"  #: closed on purpose; nothing more will arrive
 
 
 class Failsafe(StrEnum):
     """The active step of the failsafe ladder."""
 
     NONE = "none"
-    HOVER = "hover"  #: holding the position because the pilot is silent or gone
-    LAND = "land"  #: landing because there is still no pilot, or the battery is low
+    HOVER = "hover"  #: holding the position because the pilot has gone or is sending nothing
+    LAND = "land"  #: landing because there is still no pilot or because the battery is low
 
 
 class ReturnPhase(StrEnum):
@@ -132,7 +132,7 @@ class EventKind(StrEnum):
     APPLICATION_LINK = "application_link"  #: the link from application to proxy changed; data: state, reason
     VEHICLE_LINK = "vehicle_link"  #: the link from proxy to vehicle or its reason changed; data: state, reason, remedy
     AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease, identity; until_ns if limited
-    AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
+    AUTHORITY_QUEUED = "authority_queued"  #: queued, or moved up; data: app_id, priority, position; wait_s if known
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
     AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
     AUTHORITY_ASKED = "authority_asked"  #: a request to the holder; data: app_id, lease, by, by_id, by_priority …

@@ -51,7 +51,7 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
-    source: Name  #: the tracker or controller that drew it; for each source and camera, only the newest counts
+    source: Name  #: tracker or controller that drew it; only the newest annotation per source and camera is valid
     camera: Name
     captured_ns: TimeNs  #: capture time of the annotated frame
     width: Pixels  #: width of that frame
@@ -69,13 +69,13 @@ MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):
-    """One entry, which has exactly one of ``text``, ``number`` and ``values``.
+    """A log entry, which has exactly one of ``text``, ``number`` and ``values``.
 
     Raises ``ValueError`` if it has none or several of them, or if the shape does not match the values.
     """
 
-    source: Name  #: the application, or the part of it, that logged the entry
-    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text outside any series
+    source: Name  #: the application that logged the entry, or a part of it
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text that belongs to no series
     at_ns: TimeNs  #: when it was logged, on the proxy's clock
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
@@ -119,8 +119,8 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 
     processor: ProcessorName
     camera: Name
-    part: Count  #: number of the share, from 0
-    #: number of shares; 1: every frame; 0: no frames, because the worker reported that it can't take any
+    part: Count  #: number of this worker's part of the frames, from 0
+    #: number of parts; 1: every frame; 0: no frames, because the worker reported that it can't take any
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
     workers: Count  #: number of workers for this processor and camera, including paused ones
 
@@ -249,5 +249,5 @@ def _decode_extension(code: int, data: memoryview) -> Any:
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
 _decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
-_plain_decoder = msgspec.msgpack.Decoder()  # leaves arrays of numbers as bytes
+_plain_decoder = msgspec.msgpack.Decoder()  # does not convert arrays of numbers, which stay bytes
 _array_decoder = msgspec.msgpack.Decoder(_Array)

@@ -19,7 +19,7 @@ FEEDBACK: Final = "feedback"
 MIN_HZ: Final = 0.001  #: lowest rate, one sample in a quarter of an hour, so that the period stays finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
-TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be early
+TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be too early
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
@@ -48,7 +48,7 @@ class FeedbackRequest:
             known = isinstance(rate, int | float) and not isinstance(rate, bool)
             if not (known and MIN_HZ <= rate <= MAX_HZ):
                 raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
-            # Round the rate as in a topic, so that the requests at both ends are equal.
+            # Round the rate as in the topic's name, so that both ends have the same request.
             object.__setattr__(self, "max_hz", float(f"{rate:g}"))
 
     @property
@@ -96,7 +96,7 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """One consumer's request for a camera's frames; H.264 has its own topic, :attr:`stream_topic`.
+    """One consumer's request for a camera's frames; H.264 streams have a separate topic, :attr:`stream_topic`.
 
     Requests for the same frames are equal and have the same :attr:`topic`. Raises :class:`UsageError` for invalid
     values.
@@ -108,8 +108,8 @@ class VideoRequest:
     max_fps: float | None = None  #: maximum number of frames a second; None: all
     scale: float = 1.0  #: factor for width and height, greater than 0 and at most 1
     part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n is k
-    kbit_s: int | None = None  #: average H.264 rate; None: as the vehicle sent it, or as much as the path can carry
-    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to its path
+    kbit_s: int | None = None  #: average H.264 rate; None: as sent by the vehicle, or as much as the path can carry
+    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to the path to it
 
     def __post_init__(self) -> None:
         if not self.camera:
@@ -128,7 +128,7 @@ class VideoRequest:
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         self._check_stream()
         if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; by this, equivalent requests are equal
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; the same in all equivalent requests
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
@@ -222,13 +222,13 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Reduces one series of samples to an average rate.
+    """Thins a series of samples to an average rate.
 
     It keeps state, so each series and each consumer needs its own.
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Keep the first sample that arrives. None: keep all samples."""
+        """Start with the first sample to arrive, which is kept. None: keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
