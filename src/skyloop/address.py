@@ -56,12 +56,12 @@ def _hide(path: str) -> str:
 
 
 def shown_name(option: str) -> str:
-    """Return an option's name as it may be shown; if it is not a valid name, it may be the end of a password."""
+    """Return an option's name if it can be shown; an invalid name may be the end of a password, so it is hidden."""
     return option if _NAME.match(option) else HIDDEN
 
 
 def is_broken(options: Iterable[str]) -> bool:
-    """Return whether the options' names show that an address was split within its password."""
+    """Return whether the names of the options show that an address was split within its password."""
     return any("@" in option for option in options)
 
 

@@ -1,4 +1,4 @@
-"""Measure the user's machine: delays, compared to a bare hand-over of the same bytes, and the simulator's speed.
+"""Measure the user's machine: delays, compared to a bare transfer of the same bytes, and the simulator's speed.
 
 ``skyloop bench`` prints the results. The developers' measurements are in the repository's ``benchmarks/``.
 """
@@ -194,11 +194,11 @@ class BenchVehicle(Driver):
         self.publish_feedback(time.monotonic_ns())
 
     def _close(self) -> None:
-        """Do nothing: no resources are held."""
+        """Do nothing, because no resources are held."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
-        if type(action) is Velocity and action.up != self._last_up:  # differs in each call; equal ones are repeats
+        if type(action) is Velocity and action.up != self._last_up:  # an equal value is a repeat
             self._last_up = action.up
             self._received(COMMAND, stamp_of(action.up, now_ns))
         return action
@@ -267,7 +267,7 @@ class Listening:
         self._received(VIDEO, frame.captured_ns)
 
     def picture(self, picture: EncodedFrame) -> None:
-        """Report an encoded image."""
+        """Report an encoded frame."""
         self._received(VIDEO, picture.captured_ns)
 
 
@@ -299,8 +299,8 @@ class Application:
 
 # The bare hand-over -------------------------------------------------------------------------------------------------
 
-_STAMP: Final = struct.Struct("<qqq")  # time of sending, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with zero size, and three numbers: 100 bytes, as in Skyloop
+_STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
+_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with a size of zero, and three numbers: 100 bytes, as in Skyloop
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
@@ -493,7 +493,7 @@ class _Pair:
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
         """Return the delays of the samples received in a measurement [ns], by channel."""
-        for pipe in self._pipes:  # the vehicle starts before the application
+        for pipe in self._pipes:  # the vehicle must start before the application
             pipe.send(turn)
             self._answer(pipe)
         begin_ns = time.monotonic_ns() + round(_WARM_UP_S * 1e9) + _AHEAD_NS
@@ -596,13 +596,13 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: factors for the image width: the cameras' own size, and twice that
+SIZES: Final = (1.0, 2.0)  #: image widths to measure: the cameras' own size, and twice that
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
-FRAMES_PER_S: Final = 30.0  #: per camera; the drones fly for one period between images
+FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; between images, the drones fly for one period
 #: Steps per batch: a multiple of all periods, so that every batch does the same work.
 BATCH_STEPS: Final = 100
-LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if time is short
+LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if there is little time
 _TAKE_OFF_S: Final = 5.0  # simulated time before measuring begins
 #: The drone flies circles with a radius of half a metre, fast enough for rotation to blur the front camera's images.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
@@ -642,7 +642,7 @@ class SimResults(msgspec.Struct, frozen=True):
 
 
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
-    """Measure physics and rendering for about ``seconds`` on the calling thread, to which OpenCV is limited.
+    """Measure physics and rendering for about ``seconds`` on the calling thread, limiting OpenCV to that thread.
 
     Building the scenes takes additional time. If Numba is installed, compiled code renders all images, including the
     first.

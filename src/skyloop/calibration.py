@@ -16,7 +16,7 @@ MAX_BYTES: Final = 1 << 20  #: maximum size of a file; a calibration takes less 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-_SAME_SHAPE = 0.01  # tolerance for the aspect ratio, because the sizes of small images are rounded
+_SAME_SHAPE = 0.01  # tolerance when comparing aspect ratios, because the sizes of small images are rounded
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

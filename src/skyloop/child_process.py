@@ -23,7 +23,7 @@ from typing import IO, Final, Protocol
 GRACE_S: Final = 4.0  #: time for a child to exit on request, and again after being terminated
 _TAIL: Final = 2000  # bytes of a child's standard error shown in an error
 _LOOK_S: Final = 0.25  # how often to check a child that may fall silent
-#: How long to read a dead child's output, because a grandchild can keep the pipe open.
+#: Time limit for reading a dead child's output, because a grandchild can keep the pipe open.
 _DRAIN_S: Final = 1.0
 #: Variable that hands data to a child: only its user can read its environment, but all users can read command lines.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
@@ -36,7 +36,7 @@ class LeftToParent(Protocol):
     def forked(self) -> None:
         """In a child created by ``os.fork``: keep all later calls away from the parent's resources.
 
-        Other threads are gone, and their locks may stay held forever, so don't acquire any.
+        The child has no other threads, and locks they held may never be released, so don't acquire any.
         """
 
 
@@ -121,7 +121,7 @@ class ChildProcess:
 
     @property
     def ending(self) -> str:
-        """How the child ended, as text to follow its name."""
+        """How the child ended, worded to follow its name."""
         code = self.code
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
@@ -167,7 +167,7 @@ class ChildProcess:
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
         """End the child like :meth:`end`, then close its output, which no thread may still be reading. Idempotent."""
         if not self._ours:
-            return  # a thread that the fork left behind may have locked its output forever
+            return  # a thread that does not exist after the fork may have left its output locked
         self.end(grace_s, harder_s)
         self.stdout.close()
         self.close_errors()
@@ -295,7 +295,7 @@ class RestartingChild:
     def _listen(self, child: ChildProcess) -> None:
         try:
             self._read(child)
-        except Exception:  # noqa: BLE001  the child is replaced all the same
+        except Exception:  # noqa: BLE001  the child is replaced anyway
             _log.exception("killing a child process whose output can't be read")
             child.kill()
         finally:
@@ -340,7 +340,7 @@ def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """
 
     def watch() -> None:
-        with suppress(OSError):  # unreadable: as good as closed
+        with suppress(OSError):  # if it can't be read, treat it as closed
             while os.read(descriptor, 64):
                 pass
         stop()

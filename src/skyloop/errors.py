@@ -65,7 +65,7 @@ _IN_PYTHON: Final = {
 class SkyloopError(Exception):
     """Base class of all errors that Skyloop raises on purpose."""
 
-    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message says it all
+    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message is complete
 
     def with_hint(self, hint: Hint) -> Self:
         """Add a hint and return this error."""

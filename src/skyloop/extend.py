@@ -73,7 +73,7 @@ class Commands(Protocol):
     def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
 
     def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
-    def release(self, *, wait: bool = True) -> None: ...  #: release the authority; NoAnswerError if the proxy is silent
+    def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; raises NoAnswerError without a reply
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
@@ -102,7 +102,7 @@ def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = Fa
 
     Args:
         drone: The drone.
-        reason: The reason, for the log.
+        reason: Why the library lets go, for the log.
         land: Whether to land rather than hover.
         for_good: Whether the application's later commands, except for an emergency stop, raise :class:`ClosedError`.
 
@@ -172,7 +172,7 @@ def video_channel(
 
 
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-    """Return the channel of a camera's H.264; without options, pictures are as the vehicle itself encoded them.
+    """Return the channel of a camera's H.264 frames; without options, these are as encoded by the vehicle itself.
 
     Consumers are called on the receiving thread. Errors are those of :func:`video_channel`.
     """

@@ -18,7 +18,7 @@ from skyloop.errors import FileFormatError, UsageError
 T = TypeVar("T")
 
 MAX_TEXT: Final = 1 << 20  #: maximum size of a hand-written list [bytes]
-MAX_RESULTS: Final = 256 << 20  #: bytes in a file of measurements; an hour's worth takes a few megabytes
+MAX_RESULTS: Final = 256 << 20  #: maximum size of a file of measurements [bytes]; an hour's worth takes a few megabytes
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
@@ -37,7 +37,7 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
 
 
 def decoded(content: bytes) -> str:
-    """Decode UTF-8, without the byte order mark that Windows editors write.
+    """Decode UTF-8, dropping the byte order mark that Windows editors add.
 
     Raises :class:`UnicodeDecodeError`.
     """

@@ -1,8 +1,8 @@
 """Poses of the body, its cameras and targets, as SciPy's ``RigidTransform``. Needs the extra ``control``.
 
-``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s.
-Poses chain with ``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up
-(ROS REP 103); a camera's optical axes: x right, y down, z forward. Metres.
+``a_in_b`` is the pose of ``a`` in the axes of ``b``: it converts a point from ``a``'s axes to ``b``'s. Poses chain with
+``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up (ROS REP 103); a
+camera's optical axes: x right, y down, z forward. Metres.
 """
 
 from __future__ import annotations

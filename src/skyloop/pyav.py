@@ -1,4 +1,4 @@
-"""Create PyAV's decoders and encoders in one place: PyAV is optional, and imported when first needed."""
+"""Create PyAV's decoders and encoders in one place, because PyAV is optional and is imported when first needed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def new_decoder(
     """Create a decoder that returns each image at once; ``codec`` is FFmpeg's name. See :func:`require_pyav`.
 
     With ``patch``, damaged parts are filled from earlier images; otherwise a damaged image is an error. ``low_delay``
-    is False for a stream whose images depend on later ones, until whose arrival they are delayed.
+    is False for a stream whose images depend on later ones and are delayed until those arrive.
     """
     require_pyav(purpose)
     import av
@@ -39,7 +39,7 @@ def new_decoder(
     if patch:
         context.flags |= av.codec.context.Flags.output_corrupt
     else:
-        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse every end of a
+        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse the end of every
         # sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)

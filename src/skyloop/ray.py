@@ -37,7 +37,7 @@ class Workers:
             timeout_s: How long to wait for all actors [s].
 
         Raises:
-            LinkError: An actor can't continue, for example because other code took the name; the message says why.
+            LinkError: If an actor can't continue, for example because other code took its name; the message says why.
         """
         ray = _ray()
         asked = [actor.status.remote() for actor in self.actors]
@@ -94,7 +94,7 @@ def process(
         shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
         max_age_s: Frames older than this when their turn comes are skipped [s]; None: no limit.
         max_fps: Maximum frame rate of each worker; None: no limit.
-        stuck_s: If a call of ``process`` takes longer than this [s], the worker's share goes to the others.
+        stuck_s: If a call to ``process`` takes longer than this [s], the worker's frames go to the others.
         **options: Options of Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged
             with, and takes precedence over, the environment variables with which an actor finds the proxy.
 

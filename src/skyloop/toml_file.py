@@ -66,7 +66,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:
         values: dict[str, Any] = msgspec.toml.decode(text)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also for numbers and lists that are too large
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # even if it is just too large
         raise FileFormatError(f"{source}: not valid TOML: {error}") from None
     return values
 
@@ -85,7 +85,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Add the given value and a hint to msgspec's error, which has only the place and the expected type."""
+    """Add the given value and a hint to msgspec's error, which contains only the place and the expected type."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():

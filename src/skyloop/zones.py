@@ -1,4 +1,4 @@
-"""Where a vehicle may fly: the walls of a room, the safety box, and no-fly zones; all upright, in world axes. Pure.
+"""The space in which a vehicle may fly: a room's walls, a safety box and no-fly zones, upright, in world axes. Pure.
 
 World axes are x east, y north, z up [m]. The proxy decides what a vehicle does near these walls.
 """
@@ -30,7 +30,7 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane: the unit vector towards it in world axes, and its distance [m], which is negative beyond it."""
+    """A plane, given by the unit vector towards it in world axes and its distance [m], which is negative beyond it."""
 
     normal: Vec3
     distance: float
@@ -47,7 +47,7 @@ class Box:
     name: str = ""  #: name of the zone, if any
 
     def walls_inside(self, place: Vec3) -> Iterator[Wall]:
-        """Yield the walls of a box to stay inside of."""
+        """Yield the walls of a box that a vehicle must stay inside."""
         for axis in range(3):
             for sign, distance in ((-1.0, place[axis] - self.low[axis]), (1.0, self.high[axis] - place[axis])):
                 normal = [0.0, 0.0, 0.0]
@@ -71,7 +71,7 @@ class Box:
         return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two positions crosses it."""
+        """Return whether the straight line between two positions crosses the zone."""
         first, last = 0.0, 1.0
         for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
             first, last = _within(low, high, at, to, first, last)
@@ -124,7 +124,7 @@ class Cylinder:
             return False
         x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
         length = across * across + along * along
-        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # position along the infinite line
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # nearest point of the infinite line
         share = max(first, min(last, nearest))
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
@@ -144,12 +144,12 @@ Zone = Box | Cylinder
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Where a vehicle may fly."""
+    """The space in which a vehicle may fly."""
 
     room: Box | None = None  #: the room's walls, which the vehicle can't pass; None if unknown
     box: Box | None = None  #: the safety box; None if there is none
     zones: tuple[Zone, ...] = ()  #: the no-fly zones, exactly as given
-    #: The zones as they are enforced, made at least :data:`THINNEST_M` thick.
+    #: The zones that are enforced, enlarged to be at least :data:`THINNEST_M` thick.
     barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -162,7 +162,7 @@ class Space:
 
     @property
     def thin(self) -> tuple[Zone, ...]:
-        """The zones that are thickened, as written."""
+        """The zones that are enforced thicker, as originally given."""
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
@@ -202,7 +202,7 @@ def _room(text: str) -> Box | None:
     try:
         zones = parse_zones(text)
     except ParameterError:
-        return None  # a driver uses this name for something else
+        return None  # a driver uses this name for a different purpose
     return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
 
 
@@ -247,7 +247,7 @@ def _parse_zone(text: str) -> Zone:
 def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
     """Check a new value for a safety parameter against the others.
 
-    Raises :class:`ParameterError` if a wall of the box is beyond the opposite one, or the zones can't be parsed.
+    Raises :class:`ParameterError` if the box's opposite walls are the wrong way round or the zones can't be parsed.
     """
     if name == ZONES:
         parse_zones(str(value))
@@ -279,7 +279,7 @@ def _wrong(why: str) -> ParameterError:
 
 
 def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
-    """Return the part of the segment from ``at`` to ``to`` between two walls, within ``first`` to ``last``."""
+    """Return the part of the segment from ``at`` to ``to`` that is between two walls, within ``first`` to ``last``."""
     if at == to:
         return (first, last) if low <= at <= high else (1.0, 0.0)
     one, other = (low - at) / (to - at), (high - at) / (to - at)

@@ -121,7 +121,7 @@ class Drone:
                 ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
                 ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
                 ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
-                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                with smaller and fewer frames if that is low) or ``"raw"``; within one host, all frames are raw.
                 ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
@@ -173,7 +173,7 @@ class Drone:
         Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
 
         Args:
-            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            video_s: Total time to wait for frames [s]; 0: don't check cameras.
             folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
@@ -224,7 +224,7 @@ class Drone:
             LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
+            UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
         """
     async def go_to(
         self,
@@ -288,13 +288,13 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends the flight. Obstacles are not
         avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
-            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
-            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
+            land: Whether to land there instead of hovering above it; None: the parameter ``return.land``.
+            wait: Whether to wait until it has landed, or hovers above its start, rather than only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
@@ -327,7 +327,7 @@ class Drone:
 
         Args:
             priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: How long to wait in the queue [s].
+            wait_s: Maximum time to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Whether to stay in the queue after ``wait_s`` instead of raising.
@@ -343,7 +343,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
     async def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
+        """Release the authority or leave the queue, and wait until the proxy confirms it.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -412,7 +412,7 @@ class Drone:
         vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
-            timeout_s: How long to wait for the first one [s].
+            timeout_s: How long to wait for the first overview [s].
 
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
@@ -451,7 +451,7 @@ class Drone:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and so of ages and delays; 0 if both use the same clock."""
     @property
     def start_position(self) -> Vector | None:
         """Position of the last take-off in world axes: east, north, up [m]; None if unknown."""
@@ -494,7 +494,7 @@ class Drone:
         reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
-        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        connections must itself stop the others from sending. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
             False if the link is down and the stop can't be sent now.
@@ -507,7 +507,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not yet reported this application's stop, the reset is sent as soon as it has, within 2 s.
         """
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
@@ -651,20 +651,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> client.Listener[EncodedFrame]:
-        """Call ``function`` with a camera's encoded pictures, to store or forward them.
+        """Call ``function`` with a camera's encoded frames, to store or forward them.
 
         Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
-        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
+        key frame. After a loss, a key frame is requested from the proxy and delivered next. Without ``kbit_s``,
         ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
         the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
-            max_fps: Maximum pictures per second; None: all.
+            kbit_s: Rate at which the proxy encodes [kbit/s], once for all clients with the same request.
+            max_fps: Maximum number of frames per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if there are more, some are lost.
+            depth: How many frames may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -713,10 +713,10 @@ class Drone:
         :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called on the event loop; feedback overtaken by newer feedback is dropped and counted.
+            function: Called on the event loop; feedback replaced by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
-                another consumer requests more.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer does not receive more than that
+                unless another consumer requests more.
         """
     def on_event(self, function: Callable[[Event], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with each event, including the client's own (number 0).
@@ -725,7 +725,7 @@ class Drone:
 
         Args:
             function: Called on the event loop; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
+            inline: Call it on the receiving thread instead. For the client's own events, this is the thread that emits
                 them.
         """
     def on_link(self, function: Callable[[LinkStatus], object | Awaitable[object]]) -> Listener:
@@ -736,7 +736,7 @@ class Drone:
     def on_command(
         self, function: Callable[[Applied], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
+        """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -752,7 +752,7 @@ class Drone:
         It is called on the event loop.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
-        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
+        """Call ``function`` with the log entries (``drone.log``) of all applications, also this one; up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -970,7 +970,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        Drones that are set aside are left out. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -998,7 +998,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Arguments are those of :meth:`Drone.request_authority`.
+        The arguments are those of :meth:`Drone.request_authority`.
         """
     async def release_authority(self) -> None:
         """Release the authority over all active drones.
@@ -1018,7 +1018,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that don't meet it have failed.
 
         Args:
             wanted: A flight state or its name, several of these, or a predicate on feedback.
@@ -1051,7 +1051,7 @@ class Swarm:
         """Cut the motors of all drones at once, including those set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some, whatever ``on_error`` is.
+            SwarmError: If the command could not be sent to some drones, whatever the value of ``on_error``.
         """
     @property
     def spread(self) -> Distribution | None:
@@ -1085,8 +1085,8 @@ def connect(
             up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
-            an address, and then 60 s for the vehicle.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20
+            s for an address, followed by 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that

@@ -32,7 +32,7 @@ Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class LoopNotifier(Notifier):
-    """Wakes the coroutine that waits in :meth:`within`, from any thread."""
+    """Wakes, from any thread, the coroutine that waits in :meth:`within`."""
 
     __slots__ = ("_loop", "_notified")
 
@@ -73,7 +73,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
-    outside = cancelled.get()  # whether an outer thread that waits for this coroutine was cancelled
+    outside = cancelled.get()  # whether an outer thread waiting for this coroutine has been cancelled
 
     def work() -> None:
         result, error = None, None
@@ -210,7 +210,7 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
     own: Any = made
     own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
     own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
-    del own.__wrapped__  # otherwise its annotations would be used
+    del own.__wrapped__  # otherwise its annotations would take precedence
     return made
 
 
@@ -281,7 +281,7 @@ class Drone:
     """
 
     sync: client.Drone  #: the wrapped drone
-    config: Config  #: parameters of the vehicle and the proxy
+    config: Config  #: parameters of the vehicle and of the proxy
 
     def __init__(self, sync: client.Drone) -> None:
         """Wrap a connected drone."""
@@ -408,7 +408,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # otherwise they would keep commanding after a cancellation, in conflict with the next commands
+        finally:  # otherwise, after a cancellation, they would go on commanding and conflict with the next commands
             over = True
             for waiting in begun:
                 waiting.cancel()

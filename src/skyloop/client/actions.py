@@ -1,4 +1,4 @@
-"""An application's actions: how their numbers are checked, when they are complete and when they are sent. Pure.
+"""An application's actions: checks of their numbers, when they are complete and when they are sent. Pure.
 
 The newest set-point wins: it is sent at once and then repeated at a steady rate on absolute deadlines, unless a newer
 one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
@@ -38,7 +38,7 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
-AT_REST_M_S: Final = 0.3  #: a vehicle slower than this at its target has arrived
+AT_REST_M_S: Final = 0.3  #: a vehicle at its target and slower than this has arrived
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: maximum age of feedback used to convert a geographic position
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the action may be requested again
@@ -63,11 +63,11 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
-    Land: nanoseconds(60.0),  # counted from the proxy's last report that it is in progress
+    Land: nanoseconds(60.0),  # counted from the last time the proxy reports it in progress
     EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
-_MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two set-points, not counting repeats
+_MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two new set-points, not counting repeats
 _KEEP_NS: Final = nanoseconds(0.5)  #: a set-point that could not be sent is still sent later if it is at most this old
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
 _STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval between repeats of a stop, whatever the rate of other commands
@@ -108,7 +108,7 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start; for None, the proxy's parameters decide.
+    """Return the action that flies back to the start; the proxy's parameters replace values of None.
 
     Raises :class:`UsageError` if a value is not a number or bool, or makes no sense.
     """
@@ -190,7 +190,7 @@ class ReturnWatch:
     """Decides whether a return flight is over. Call it with each new sample of feedback."""
 
     def __init__(self) -> None:
-        """Start before the command is sent."""
+        """Prepare the watch; call this before the command is sent."""
         self._began = False
 
     def __call__(self, feedback: Feedback) -> bool:
@@ -201,7 +201,7 @@ class ReturnWatch:
 
 
 class Unsent(NamedTuple):
-    """A one-off request that the transport had no room for."""
+    """A one-off request that could not be sent because the transport had no room."""
 
     action: AnyAction
     intent: int
@@ -213,7 +213,7 @@ class CommandSchedule:
     """Stores the newest set-point of one application. Times are on this process's clock."""
 
     def __init__(self, *, rate_hz: float = 32.0, stall_s: float = 1.0) -> None:
-        """Start without a set-point; repeat at 1 to 200 Hz. Raises :class:`UsageError` if an argument is out of range.
+        """Start without a set-point; repeat later ones at 1 to 200 Hz. Raises :class:`UsageError` for invalid values.
 
         After ``stall_s`` without a call, a velocity or attitude decays to hover; ``math.inf``: never. Flights to a
         target and return flights do not decay: the vehicle stops there.
@@ -228,7 +228,7 @@ class CommandSchedule:
         self.intent = 0  #: number of the newest intent
         self.automatic = False  #: whether the newest set-point is the library's own
         self.over: Outcome | None = None  #: how the newest intent ended, once it has
-        self.owed: Unsent | None = None  #: a one-off request that was not sent
+        self.owed: Unsent | None = None  #: a one-off request that could not be sent yet
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
@@ -238,12 +238,12 @@ class CommandSchedule:
         self._sent_intent = 0
         self.due_ns = 0  #: time at which :meth:`next` will have something to send
         self._failsafe = Failsafe.NONE
-        self._reset_asked_ns: int | None = None  # during a stop
+        self._reset_asked_ns: int | None = None  # when a reset was requested while a stop was active
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
         """Make ``action``, already allowed by :meth:`may_ask`, the set-point; return the number of this intent.
 
-        ``automatic``: the library's own action, not the application's.
+        ``automatic``: whether the library, rather than the application, requests it.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -283,7 +283,7 @@ class CommandSchedule:
         return self._new_sent_ns + _MIN_INTERVAL_NS
 
     def next(self, now_ns: int) -> AnyAction | None:
-        """Return the action to send now, under the current :attr:`intent`; None if it is too early."""
+        """Return the action to send now under the current :attr:`intent`; None if nothing is due yet."""
         if now_ns < self.due_ns:
             return None
         kind, since_ns, is_sent = type(self.action), now_ns - self._asked_ns, self.intent == self._sent_intent
@@ -327,23 +327,23 @@ class CommandSchedule:
         return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
-        """Return whether the set-point ``before`` has decayed to hover because the application made no calls."""
+        """Return whether the set-point ``before`` has decayed to hover for lack of calls by the application."""
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
-        """End the set-point if the proxy reports its intent as ended, or a failsafe has overruled it."""
+        """End the set-point if the proxy reports that its intent has ended, or if a failsafe has overruled it."""
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
         if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
             if outcome.over:
                 self._end(outcome)
             elif kind is Land and feedback.state is not FlightState.UNKNOWN:
-                self._asked_ns = now_ns  # the proxy continues it, however long it takes
+                self._asked_ns = now_ns  # the proxy continues the landing, however long it takes
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
         elif (
-            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; any pilot may stop
+            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; any pilot may trigger a stop
             and feedback.state in done_in
             and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         ):
@@ -368,7 +368,7 @@ class CommandSchedule:
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
         """Resume sending on the connection made at ``connected_ns``, without a set-point that is too old."""
-        if now_ns - self._asked_ns > _KEEP_NS:  # on this connection, only the lease was missing
+        if now_ns - self._asked_ns > _KEEP_NS:  # the connection has stayed the same, and only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

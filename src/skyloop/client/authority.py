@@ -73,8 +73,8 @@ class AuthorityStatus:
     priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
     holder: str | None = None  #: name of the application that holds it; None: none, or unknown
     position: int = 0  #: position in the queue, 1 being next; 0 if unknown
-    expected_wait_s: float | None = None  #: if all those ahead keep to their announced times [s]; None if unknown
-    until_ns: int | None = None  #: end of the time that was requested, on the proxy's clock; None: unlimited
+    expected_wait_s: float | None = None  #: if all requests ahead keep to their announced times [s]; None if unknown
+    until_ns: int | None = None  #: when the requested time ends, on the proxy's clock; None: unlimited
 
 
 class EndedSessions:
@@ -112,7 +112,7 @@ class AuthorityTracker:
         self._run_id = 0
         self._owner_id = 0  # the owner in the last feedback; 0: none
         self.app_id = 0
-        self.wanted = False  #: the application requested it and has not released it
+        self.wanted = False  #: whether the application has requested the authority and not released it
         self.pending = False  #: the authority was requested on this connection, but no answer has arrived yet
         self.status = AuthorityStatus()
         self.last_request = RequestAuthority()  #: the last request, which is repeated on a new connection
@@ -134,12 +134,12 @@ class AuthorityTracker:
 
     @property
     def answered(self) -> bool:
-        """Whether it is held, queued for, or no longer wanted. A lost link does not count as an answer."""
+        """Whether the authority is held, queued for, or no longer wanted. A lost link does not count as an answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)
 
     @property
     def behind_itself(self) -> bool:
-        """Whether it is only waiting for the proxy to notice that an earlier session of this process has ended."""
+        """Whether the proxy has only yet to notice that an earlier session of this process has ended."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
@@ -170,13 +170,13 @@ class AuthorityTracker:
         self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """Record a grant from a reply, an event or feedback; ignore one that has been lost since.
+        """Record a grant from a reply, an event or feedback, unless it has been lost in the meantime.
 
         ``until_ns``: when the lease ends, on the proxy's clock; None: never, or as already known.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
-            return False  # the late report of an old lease, which has been lost since
+            return False  # this is a late report of an old lease that has been lost since then
         if until_ns is None and lease == self._lease:
             until_ns = self.status.until_ns  # feedback and some events do not repeat the time limit
         self._lease, self._granted_ns = lease, now_ns
@@ -206,7 +206,7 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
         lease = _whole(data.get("lease"))
-        late = self.status.state == "preempted" and lease == self._lease  # feedback has already shown the next holder
+        late = self.status.state == "preempted" and lease == self._lease  # feedback has already named the next holder
         if not ours or not (late or (self.held and lease >= self.status.lease)):
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
@@ -230,7 +230,7 @@ class AuthorityTracker:
             newer = feedback.lease > self.status.lease
             until_ns = self.status.until_ns
             if newer and until_ns is not None and feedback.captured_ns >= until_ns:
-                return self.given_back()  # its time is over, and the event was lost or is late
+                return self.given_back()  # its time has run out, and the event was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):
@@ -292,9 +292,9 @@ def answering(
     app_id: Callable[[], int],
     answer: Callable[[int, int, bool, str], None],
 ) -> Callable[[Event], None]:
-    """Return a callback for events that calls ``function`` when this application is asked to hand the authority over.
+    """Return a callback for events that calls ``function`` when another application requests this one's authority.
 
-    ``answer`` is called with the lease, the number of the requesting application, the decision, and the reason. Raises
+    ``answer`` is called with the lease, the requesting application's number, the decision and the reason. Raises
     :class:`UsageError` if ``function`` can't be called.
     """
     if not callable(function):

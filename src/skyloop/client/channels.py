@@ -72,7 +72,7 @@ class Channel(Generic[T]):
 
     @contextmanager
     def into(self, mailbox: Holder[T]) -> Iterator[None]:
-        """Deliver into ``mailbox`` during the block."""
+        """Deliver samples into ``mailbox`` during the block."""
         put = mailbox.put
         self.add(put, lambda: mailbox.dropped)
         try:
@@ -94,7 +94,7 @@ class Channel(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Samples that consumers missed, including consumers that have been removed."""
+        """Number of samples that consumers missed, including consumers since removed."""
         with self._lock:
             return self._dropped_before + sum(dropped() for dropped in self._drops.values())
 
@@ -104,7 +104,7 @@ class Channel(Generic[T]):
             consumer(sample)
 
     def _update(self) -> None:
-        """Subscribe or unsubscribe if that has changed. The lock is held."""
+        """Subscribe or unsubscribe if the need has changed. The lock is held."""
         wanted = self.kept or bool(self._consumers)
         if wanted is not self.subscribed:
             self.subscribed = wanted
@@ -155,7 +155,7 @@ def _since(dropped: Callable[[], int], before: int) -> int:
 
 
 class Listener(Generic[T]):
-    """An application's callback, called with samples until :meth:`cancel` or the end of its block.
+    """An application's callback, which is called with samples until :meth:`cancel` or the end of its block.
 
     The function has its own thread and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
     samples and delays no other consumer. With ``inline=True`` it is called on the receiving thread, before the next
@@ -174,7 +174,7 @@ class Listener(Generic[T]):
         inline: bool = False,
         on_cancel: Callable[[Listener[T]], None] | None = None,
     ) -> None:
-        """Start calling ``function`` with each sample of ``channel``, of which ``depth`` may wait.
+        """Start calling ``function`` with each sample of ``channel``; up to ``depth`` samples may wait.
 
         ``report`` is called with this listener's ``name``, which is also the name of its thread, and each exception of
         ``function``; ``on_cancel`` is called with this listener. ``inline``: call the function on the publishing thread
@@ -209,7 +209,7 @@ class Listener(Generic[T]):
         """Stop calling the function. Idempotent.
 
         Args:
-            wait: Wait up to 2 s for a call in progress; ignored if called from the function itself.
+            wait: Whether to wait up to 2 s for a call in progress; ignored if called from the function itself.
         """
         self._channel.remove(self._consumer)
         self._mailbox.close()
@@ -241,9 +241,9 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
-        except ClosedError:  # the drone was closed, or its flight ended: not an error of the function
+        except ClosedError:  # the drone was closed or its flight ended, which is not an error of the function
             self.errors += 1
-        except SystemExit as error:  # it would end only this thread, unnoticed
+        except SystemExit as error:  # otherwise it would only end this thread, unnoticed
             self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
@@ -252,14 +252,14 @@ class Listener(Generic[T]):
     def _failed(self, error: Exception) -> None:
         now_s = time.monotonic()
         if now_s < self._next_report_s:
-            return  # report at most once a second; ``errors`` counts all
+            return  # report at most once a second; ``errors`` counts every one
         self._next_report_s = now_s + _REPORT_EVERY_S
         _log.error("%s raised %r (%d times so far)", self.name, error, self.errors, exc_info=error)
         self._report(self.name, error)
 
 
 class Holder(Protocol[T_contra]):
-    """A target for samples: a mailbox, or several that are emptied together."""
+    """A destination for samples: a mailbox, or several that are emptied together."""
 
     def put(self, item: T_contra, /) -> None:
         """Add the newest item and wake the consumer."""
@@ -327,7 +327,7 @@ class Mailbox(Generic[T]):
         """Discard all items and wake the consumer, which then receives None."""
         self.closed = True
         with self._lock:
-            self._offered -= len(self._items)  # discarded items count as neither delivered nor dropped
+            self._offered -= len(self._items)  # discarded items are counted neither as delivered nor as dropped
             self._items.clear()
         self.notifier.notify()
 
@@ -335,8 +335,8 @@ class Mailbox(Generic[T]):
 class Notifier:
     """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
 
-    Each waiting thread adds its own lock and then checks its condition again. This way no notification is missed, and
-    the notifying thread, which receives for all consumers, never acquires a lock.
+    Each waiting thread adds its own lock and then checks its condition again. In this way, no notification is missed,
+    and the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
     __slots__ = ("_waiting",)

@@ -34,13 +34,13 @@ CONNECTORS: Final = "skyloop.connectors"
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
-_OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output of the child before checking on it
+_OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output from the child before checking whether it still runs
 ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: maximum time for which the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Where the options of earlier versions have moved.
+#: Where to pass options that earlier versions took directly.
 _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
     "keys": "network=skyloop.Network"
 }
@@ -136,8 +136,8 @@ def connect(
             up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
-            an address, and then 60 s for the vehicle.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20
+            s for an address, followed by 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
@@ -184,7 +184,7 @@ def prepare(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
-        # Another process can use the bare name only if it finds the proxy without network settings.
+        # Other processes can use the bare name only if they find the proxy without network settings.
         options["reach"] = target if network is None or network is False else None
         return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
@@ -225,7 +225,7 @@ class Connector(Protocol):
         """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``."""
 
     def close(self) -> None:
-        """Stop everything started. Idempotent."""
+        """Stop everything that was started. Idempotent."""
 
 
 class PrivateProxy:
@@ -242,15 +242,15 @@ class PrivateProxy:
         self.reach = self.name
         self.uri = shown_address(uri)
         self.scheduler = Scheduler()
-        self._served = False  # whether it has served a client, and so may have a vehicle in the air
+        self._served = False  # whether it has served a client, and therefore may have a vehicle in the air
         self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
         """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``.
 
-        The dialer raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no
-        sense, and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
+        The dialer raises :class:`NoAnswerError` if this takes too long, :class:`UsageError` if the address is invalid,
+        and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
         """
         inner = _local(self.name)
 
@@ -294,7 +294,7 @@ class PrivateProxy:
         raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 
     def _wait_for_output(self) -> None:
-        """Sleep until the child prints something (such as its readiness), ends, or a moment has passed."""
+        """Sleep until the child prints something (such as its readiness), it ends, or a short time has passed."""
         stdout = self._process.stdout
         if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
             time.sleep(0.005)  # the child has closed its output and is about to exit

@@ -56,14 +56,14 @@ class ProxyConnection:
         self.state = LinkState.CONNECTING
         self.reason = ""
         self.why_closed = ""  #: why requests are not possible; empty while they are
-        self.poked = False  #: whether the supervisor must run now
+        self.poked = False  #: whether the supervisor must run immediately
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
         self._clock = clock
         self._topics: list[str] = []
-        self._lock = threading.Lock()  # guards the topics and the switch between sessions
-        self.session: ProxySession | None = None  #: the current one; switched under the lock
-        self._malformed_before = self._missing_before = 0  # totals of earlier sessions
+        self._lock = threading.Lock()  # guards the topics and the replacement of the session
+        self.session: ProxySession | None = None  #: the current session; replaced under the lock
+        self._malformed_before = self._missing_before = 0  # totals over earlier sessions
 
     @property
     def connected(self) -> bool:
@@ -167,8 +167,8 @@ class ProxyConnection:
     ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
-        ``body`` returns the request, for each attempt, ``may_repeat`` whether to repeat it if the link breaks between
-        sending it and receiving the answer.
+        ``body`` returns the request and is called for each attempt. ``may_repeat``: whether to repeat it if the link
+        breaks between sending it and receiving the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
@@ -200,7 +200,7 @@ class ProxyConnection:
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:
-        """Stop sending and waiting: the session belongs to the parent process."""
+        """Stop sending and waiting, because the session belongs to the parent process."""
         self.why_closed = (
             f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect again here"
         )
@@ -211,7 +211,7 @@ class ProxyConnection:
     # For the supervisor ----------------------------------------------------------------------------------------
 
     def attach(self, session: ProxySession) -> None:
-        """Send through ``session`` from now on, and subscribe to all active topics in it."""
+        """Send through ``session`` from now on, and subscribe it to all active topics."""
         with self._lock:
             for topic in self._topics:
                 session.subscribe(topic, True)
@@ -220,7 +220,7 @@ class ProxyConnection:
         self.poke()
 
     def detach(self) -> ProxySession | None:
-        """Stop sending until there is another session; return the previous one."""
+        """Stop sending until a new session is attached; return the previous one."""
         with self._lock:
             session, self.session = self.session, None
             self.transmit = _nowhere
@@ -324,7 +324,7 @@ class ConnectionSupervisor:
         return max(0.0, (due_ns - self._clock()) / 1e9)
 
     def _judge(self, session: ProxySession, now_ns: int) -> bool:
-        """Update the link's state; return False if the session was dropped."""
+        """Update the link's state; return False if the session has been dropped."""
         session.tick(now_ns)
         verdict = session.monitor.verdict(now_ns)
         reason = session.closed_reason or (verdict.reason if verdict.restart else None)
@@ -348,7 +348,7 @@ class ConnectionSupervisor:
         return 0.0
 
     def _connect(self) -> None:
-        """Dial and send Hello. The attempt counts as failed until feedback arrives; if it never does, pauses grow."""
+        """Dial and send Hello. The attempt counts as failed, lengthening the next pause, until feedback arrives."""
         self._failures += 1
         session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock, self._dial)
         try:
@@ -411,7 +411,7 @@ class ReceivingNotifier(Notifier):
         self._connection = connection
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true; see :meth:`Notifier.wait_for`. May take 50 ms longer than ``timeout_s``."""
+        """Wait until ``ready()`` is true, up to 50 ms longer than ``timeout_s``; see :meth:`Notifier.wait_for`."""
         deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not ready():
             left_s = deadline_s - time.monotonic()

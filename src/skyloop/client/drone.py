@@ -95,7 +95,7 @@ DOWN: Final = frozenset({FlightState.LANDED})
 EVENT_DEPTH: Final = 256  #: maximum number of events, log entries and so on waiting for a slow callback
 WHOLE_S: Final = 1.0  #: time limit for a complete sample of feedback, if a reduced rate was requested [s]
 _CAMERA_CHECK_S: Final = 0.5  #: how often a thread waiting for a frame checks that its camera still exists
-_SOON_S: Final = 1.0  #: a vehicle that is still starting up after this time is reported in the log
+_SOON_S: Final = 1.0  #: time after which a vehicle that is still starting up is reported in the log
 _ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
 
@@ -135,7 +135,7 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
 def _all_finite(a: object, b: object, c: object, d: object) -> bool:
     """Return whether four values are floats that can be commanded unchanged, without calling :func:`number` for each.
 
-    False does not mean invalid: ints, or four huge floats whose sum overflows, may be fine.
+    False does not mean that they are invalid: ints, or four huge floats whose sum overflows, may be valid.
     """
     floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
     return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
@@ -149,13 +149,13 @@ class Drone:
     other threads raise :class:`ClosedError`, except for an emergency stop. A drone that others are flying is left
     alone, and a drone returning because its battery is low continues to return. ``sys.exit()`` in a callback ends the
     flight in the same way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during
-    :meth:`land` the landing continues. A call with ``wait=False`` has nothing to interrupt. A lost connection to the
+    :meth:`land` the landing continues. With ``wait=False``, there is nothing to interrupt. A lost connection to the
     proxy is re-established, however long that takes, and everything except old set-points is restored.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. All commands except :meth:`takeoff` and
     :meth:`land` return True if the command was handed to the transport. They return False while the link is down or the
-    authority has not been granted yet; the command is sent once both are available, unless it is over 0.5 s old by
+    authority has not been granted yet; the command is sent once both are available, unless it is more than 0.5 s old by
     then. Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for
     example on the ground or while others fly the vehicle; events give the reason. Every command raises:
 
@@ -298,7 +298,7 @@ class Drone:
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and so of ages and delays; 0 if both use the same clock."""
         return self._connection.uncertainty_ns
 
     @property
@@ -383,7 +383,7 @@ class Drone:
 
         Args:
             priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: How long to wait in the queue [s].
+            wait_s: Maximum time to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
             stay: Whether to stay in the queue after ``wait_s`` instead of raising.
@@ -403,7 +403,7 @@ class Drone:
         return self._commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
+        """Release the authority or leave the queue, and wait until the proxy confirms it.
 
         Does nothing if the authority is neither held nor requested.
 
@@ -464,7 +464,7 @@ class Drone:
             LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
+            UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
         """
         self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
@@ -578,13 +578,13 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends the flight. Obstacles are not
         avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
-            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
-            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
+            land: Whether to land there instead of hovering above it; None: the parameter ``return.land``.
+            wait: Whether to wait until it has landed, or hovers above its start, rather than only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
@@ -606,7 +606,7 @@ class Drone:
         reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
-        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        connections must itself stop the others from sending. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
             False if the link is down and the stop can't be sent now.
@@ -621,7 +621,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not yet reported this application's stop, the reset is sent as soon as it has, within 2 s.
         """
         return self._commands.command(ResetEmergency())
 
@@ -697,7 +697,7 @@ class Drone:
         vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
-            timeout_s: How long to wait for the first one [s].
+            timeout_s: How long to wait for the first overview [s].
 
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
@@ -810,7 +810,7 @@ class Drone:
                 ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
                 ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
                 ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
-                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                with smaller and fewer frames if that is low) or ``"raw"``; within one host, all frames are raw.
                 ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
@@ -883,10 +883,10 @@ class Drone:
         :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called in its own thread; feedback overtaken by newer feedback is dropped and counted.
+            function: Called in its own thread; feedback replaced by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
-                another consumer requests more.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer does not receive more than that
+                unless another consumer requests more.
         """
         channel = self._state.feedback_channel(_feedback_request(max_hz))
         return self._listen(channel, function, "feedback", inline=inline)
@@ -903,7 +903,7 @@ class Drone:
 
         Args:
             function: Called in its own thread; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
+            inline: Call it on the receiving thread instead. For the client's own events, this is the thread that emits
                 them.
         """
         return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
@@ -913,7 +913,7 @@ class Drone:
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
-        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
+        """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
@@ -927,7 +927,7 @@ class Drone:
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
+        """Call ``function`` with the log entries (``drone.log``) of all applications, also this one; up to 256 wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
@@ -981,20 +981,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> Listener[EncodedFrame]:
-        """Call ``function`` with a camera's encoded pictures, to store or forward them.
+        """Call ``function`` with a camera's encoded frames, to store or forward them.
 
         Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
-        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
+        key frame. After a loss, a key frame is requested from the proxy and delivered next. Without ``kbit_s``,
         ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
         the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
-            max_fps: Maximum pictures per second; None: all.
+            kbit_s: Rate at which the proxy encodes [kbit/s], once for all clients with the same request.
+            max_fps: Maximum number of frames per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if there are more, some are lost.
+            depth: How many frames may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -1153,7 +1153,7 @@ class Drone:
         Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
 
         Args:
-            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            video_s: Total time to wait for frames [s]; 0: don't check cameras.
             folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
@@ -1165,7 +1165,7 @@ class Drone:
         state = self._state
         before = None if state.demand.request.is_plain else state.newest
         with state.demand.wanted(PLAIN):
-            if before is not None:  # a reduced rate was requested: wait for a complete sample
+            if before is not None:  # if a reduced rate was requested, wait for a complete sample
                 state.notifier.wait_for(lambda: state.newest is not before, WHOLE_S)
             return inspect(self, state.newest, video_s, folder)
 
@@ -1184,7 +1184,7 @@ class Drone:
             if self._connection.connected:
                 self._commands.release(wait=not self._connection.receiving)
         except LinkError:
-            pass  # the link is already lost, and the authority with it
+            pass  # the link is already lost, and with it the authority
         finally:
             self._supervisor.close()
             listeners = list(self._state.listeners)

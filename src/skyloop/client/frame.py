@@ -32,7 +32,7 @@ else:
     _Base = np.ndarray
 
 HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
-_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display pictures at once and rarely keep them
+_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display images at once and rarely keep them
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
@@ -101,7 +101,7 @@ class Frame(_Base):
 
     @property
     def feedback_reach_s(self) -> float | None:
-        """Time between the capture and the more distant sample used for :attr:`feedback` [s]; None if there is none."""
+        """Time from the capture to the farther sample used for :attr:`feedback` [s]; None if there are no samples."""
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
@@ -109,7 +109,7 @@ class Frame(_Base):
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:
-        """Return the picture as PNG for display in a notebook; None for a slice that is not a picture."""
+        """Return the image as PNG for display in a notebook; None for a slice that is not an image."""
         return png(np.asarray(self))
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
@@ -144,7 +144,7 @@ def png(image: NDArray[Any]) -> bytes | None:
 
 
 class Arrival:
-    """A received frame. The first consumer that needs the image decodes it, in its own thread, for all."""
+    """A received frame. The first consumer that needs the image decodes it in its own thread, on behalf of all."""
 
     __slots__ = (
         "_clock",
@@ -170,10 +170,10 @@ class Arrival:
         clock: Clock = time.monotonic_ns,
         scale: float = 1.0,
     ) -> None:
-        """Store a frame received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
+        """Store a frame received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
-        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled
-        down by the factor ``scale`` for width and height when it is decoded.
+        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled when
+        it is decoded: its width and height are multiplied by ``scale``.
         """
         self.header = self._full = header
         if scale != 1.0:
@@ -311,7 +311,7 @@ class FeedbackHistory:
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
     """Interpolate the state at a time linearly between two samples, with angles taking the shorter way round.
 
-    Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
+    Fields that only one of the two has, or that can't be interpolated (states, names), are taken from the nearer one.
     """
     share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
     nearer = a if share < 0.5 else b

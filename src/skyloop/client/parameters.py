@@ -50,7 +50,7 @@ class Restorer:
         self._written: dict[str, Value] = {}
         self._run_id = 0
         self._lease = 0  # our last lease in this run of the proxy
-        self._missed = False  # the connection was lost since that lease, so events may be missing
+        self._missed = False  # whether the connection was lost after that lease, so that events may be missing
         self._restore = False  # the proxy has restarted since the values were written
 
     def written(self, parameter: Parameter) -> None:
@@ -65,7 +65,7 @@ class Restorer:
             self._written.pop(name, None)
 
     def connected(self, run_id: int) -> None:
-        """Handle a new connection, to this run of the proxy."""
+        """Handle a new connection to the run of the proxy that has this number."""
         with self._lock:
             self._missed = True
             if run_id != self._run_id:
@@ -92,7 +92,7 @@ class Restorer:
         def done(answer: AnyReply | LinkError) -> None:
             if isinstance(answer, LinkError):
                 with self._lock:
-                    self._restore = True  # lost again: retried with the next grant
+                    self._restore = True  # the link was lost again: retry after the next grant
             elif isinstance(answer, Refused):
                 text = f"{name} could not be restored to {value!r}: {answer.message}"
                 self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)

@@ -50,7 +50,7 @@ _log = logging.getLogger("skyloop")
 
 
 class Piloting:
-    """One application's piloting of its vehicle, up to the end of the flight. Thread-safe."""
+    """How one application pilots its vehicle until the end of the flight. Thread-safe."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Piloting:
         on_exit: OnExit,
         close: Callable[[], None],
     ) -> None:
-        """Prepare to fly; ``close`` ends the connection, after the end of the flight."""
+        """Prepare to fly; ``close`` ends the connection after the flight has ended."""
         self.commands = commands
         self._connection = connection
         self._state = state
@@ -71,7 +71,7 @@ class Piloting:
 
     @property
     def closed(self) -> bool:
-        """Whether the drone was closed, or belongs to the parent process."""
+        """Whether the drone has been closed or belongs to the parent process."""
         return self._connection.why_closed != ""
 
     @property
@@ -95,13 +95,13 @@ class Piloting:
     ) -> None:
         """Send the command and, with ``wait``, wait until feedback shows that it is complete; see :meth:`Drone.land`.
 
-        If a take-off is not done in time, let the vehicle go. Do so too if the caller stops waiting, for example
-        after Ctrl-C, unless it was waiting for a landing.
+        If a take-off is not complete in time, give up control of the vehicle. Do so too if the caller stops waiting,
+        for example after Ctrl-C, unless it was waiting for a landing.
         """
         if not wait:
             self.commands.command(action, now=True)
             return
-        if type(action) is not Land:  # a landing is commanded in any case, as nothing is safer
+        if type(action) is not Land:  # a landing is commanded in any case, because nothing is safer
             self._connection.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
         waiting = None
@@ -120,7 +120,7 @@ class Piloting:
             raise
 
     def report(self, where: str, error: Exception | SystemExit) -> None:
-        """Emit an event for an exception in an application's callback; ``sys.exit()`` ends the flight."""
+        """Emit an event for an exception in an application's callback; ``sys.exit()`` also ends the flight."""
         text = f"{where} raised {type(error).__name__}: {error}"
         self._state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
         if isinstance(error, SystemExit) and not self.ending:
@@ -133,9 +133,9 @@ class Piloting:
     def let_go(self, reason: str, *, land: bool = False) -> bool:
         """Hover or land by the library's own decision; this is the only place where it does so.
 
-        As no person decided it, the vehicle is left alone, here and by the proxy, if others fly it, if it is landing or
-        returning, or if the application itself has landed or stopped it. A take-off without visible effect is
-        cancelled. If ``land`` is True, it lands instead of hovering. Returns whether anything was sent.
+        Because no person decided this, the vehicle is left alone, here and by the proxy, if others are flying it, if it
+        is landing or returning, or if the application itself has landed or stopped it. A take-off without visible
+        effect is cancelled. If ``land`` is True, it lands instead of hovering. Returns whether anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -159,9 +159,9 @@ class Piloting:
     def end_flight(self, report: Callable[[str], object] = lambda _: None) -> SkyloopError | None:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
-        From the start, commands from the application's other threads raise :class:`ClosedError`; only an emergency stop
-        is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent. ``report`` is
-        called with a text for each step. Returns the error, or None.
+        As soon as it starts, commands from the application's other threads raise :class:`ClosedError`; only an
+        emergency stop is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
+        ``report`` is called with a text for each step. Returns the error, or None.
         """
         if self.closed:  # also in a fork, where another thread may have held the locks
             return None
@@ -176,12 +176,12 @@ class Piloting:
     def bring_down(
         self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
-        """Land and wait for the landing if this application flies the vehicle, or let go; see :meth:`end_flight`."""
+        """If this application flies the vehicle, land and wait for the landing, else let go; see :meth:`end_flight`."""
         self.finish_stop()
         feedback = self._state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
-                if land and feedback.others and feedback.state not in _SINKING:  # it may have been ours a minute ago
+                if land and feedback.others and feedback.state not in _SINKING:  # we may have flown it until recently
                     _log.warning("%s: %s: it stays in the air, not landed from here", self._state.name, whose)
                 report(f"{whose}: leaving the drone to it")
             return None
@@ -205,7 +205,7 @@ class Piloting:
         return None
 
     def finish_stop(self) -> None:
-        """Wait up to 2 s until the vehicle reports an emergency stop, which would otherwise end with the connection."""
+        """Wait up to 2 s until the vehicle reports an emergency stop, which closing would otherwise end too early."""
         if self._connection.connected and not self._connection.receiving:
             self._state.notifier.wait_for(lambda: not self.commands.schedule.stopping, STOP_S)
 
@@ -221,13 +221,13 @@ class Piloting:
         return "" if newest is None else newest.others or ""
 
     def _flies(self) -> bool:
-        """Return whether this application has the vehicle in the air, or has just commanded a take-off."""
+        """Return whether this application is flying the vehicle or has just commanded a take-off."""
         newest = self._state.newest
         if self._state.status.vehicle is LinkState.CLOSED:
             return False  # a recording that has ended has no vehicle to land
         airborne = newest is not None and newest.state.airborne
         if newest is not None and newest.others:
-            return False  # others fly it, too: we must not land or stop it
+            return False  # others are also flying the vehicle, so we must not land or stop it
         return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
 
 
@@ -244,7 +244,7 @@ class ActionWait:
         *,
         automatic: bool,
     ) -> None:
-        """Send the action with :meth:`CommandSender.ask`; ``is_done`` judges feedback newer than that."""
+        """Send the action with :meth:`CommandSender.ask`; ``is_done`` is called with the feedback that follows."""
         self._action = action
         self._is_done = is_done
         self._automatic = automatic
@@ -253,9 +253,9 @@ class ActionWait:
         self._connection = connection
         self._problem: Exception | None = None
         self._why = ""  # why it was not done yet, as text
-        self._why_link: LinkState | None = None  # the vehicle's link at that time, which the text may mention
+        self._why_link: LinkState | None = None  # state of the vehicle's link at that time, which the text may mention
         self._flew = False  # whether it has been in the air since
-        self._refused, self._refused_ns = 0, 0  # our newest intent that was not possible yet; its first refusal
+        self._refused, self._refused_ns = 0, 0  # newest intent not possible yet, time of its first refusal
         self._asked_ns = state.scheduler.clock()
         # The call may take the vehicle from its pilot at present, or at the time when the call can first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
@@ -263,7 +263,7 @@ class ActionWait:
 
     @property
     def outdone(self) -> bool:
-        """Whether the application has commanded something else since. A set-point after a take-off does not count."""
+        """Whether the application has since commanded something else. A set-point after a take-off does not count."""
         commands = self._commands
         behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
         return commands.intent != self._intent and not behind
@@ -276,7 +276,7 @@ class ActionWait:
             ClosedError: If the drone is closed.
             AuthorityError: If another application takes over.
             UnsupportedError: If the vehicle does not support it.
-            RefusedError: If the proxy refuses it in the present state, or something ends it.
+            RefusedError: If the proxy refuses it in the present state, or it is ended by something else.
         """
         if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
             raise NoAnswerError(self._not_reached(timeout_s))
@@ -285,7 +285,7 @@ class ActionWait:
 
     def _over(self) -> bool:
         """Return whether the action is done or there is no point in waiting any longer."""
-        if type(self._action) is Land and self._done():  # whoever landed it
+        if type(self._action) is Land and self._done():  # no matter who landed it
             return True
         self._problem = self._why_not()
         return self._problem is not None or self._done()
@@ -308,7 +308,7 @@ class ActionWait:
         return True
 
     def _why_not(self) -> Exception | None:
-        """Return why waiting longer would be pointless; None if it isn't. Repeats a request that may succeed later."""
+        """Return why waiting any longer is pointless; None if it isn't. Repeats a request that may succeed later."""
         name = self._action.name
         if self._connection.why_closed or (self._commands.barred and not self._automatic):
             return ClosedError(f"this drone was closed during {name}")
@@ -319,8 +319,8 @@ class ActionWait:
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._note(told.text)  # cleared once a repeat is executed
-            if not told.over:  # it was executed, so later holders took the vehicle afterwards
+            self._note(told.text)  # the text is cleared once a repeat is executed
+            if not told.over:  # it was executed, so holders after that took the vehicle later
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -357,7 +357,7 @@ class ActionWait:
         if outcome.fate in OUTDONE:
             if self._called_off():
                 return _replaced(self._action)
-            return None  # a take-off in progress always ends
+            return None  # a take-off in progress always comes to an end
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING

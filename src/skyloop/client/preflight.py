@@ -21,10 +21,10 @@ from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
-STALE_S: Final = 1.0  #: maximum age of current feedback [s]
+STALE_S: Final = 1.0  #: maximum age for feedback to count as current [s]
 STALE_VIDEO_S: Final = 1.0
 CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
-LEVEL_RAD: Final = 0.12  #: maximum tilt of a vehicle that counts as level [rad]
+LEVEL_RAD: Final = 0.12  #: maximum tilt at which a vehicle counts as level [rad]
 ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
@@ -37,7 +37,7 @@ class Level(StrEnum):
 
     OK = "ok"
     WARN = "warn"  #: it can fly, but lacks something helpful
-    FAIL = "fail"  #: it would not fly, or not safely
+    FAIL = "fail"  #: it would not fly at all, or not safely
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class PreflightFinding:
     level: Level  #: how serious the finding is
     detail: str  #: the result
     why: str = ""  #: why it matters; empty if all is well
-    remedy: str = ""  #: what to do about it; empty if nothing
+    remedy: str = ""  #: what to do about it; empty if there is nothing to do
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,8 @@ class PreflightState:
     parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty: they were not read
     clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
     app_id: int = 0  #: this application's number in this run of the proxy
-    free_bytes: int | None = None  #: free space of the disk for recordings; None: not requested
-    video_waited_s: float = 0.0  #: time spent waiting for pictures
+    free_bytes: int | None = None  #: free space on the disk for recordings [bytes]; None: not requested
+    video_waited_s: float = 0.0  #: time spent waiting for frames
     name: str = "NAME"  #: the drone's name, used in the commands that remedies suggest
 
 
@@ -97,7 +97,7 @@ def inspect(
     except ClosedError:
         raise
     except SkyloopError:
-        parameters = {}  # the link is not up, which is a finding in itself
+        parameters = {}  # the link is not up, which is reported as a finding
     shown = shown_cameras(drone.capabilities, parameters)
     return check_before_flight(
         PreflightState(
@@ -117,7 +117,7 @@ def inspect(
 
 
 def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
-    """Return the age of a picture of each camera; None if none arrived in time. Waits only for shown cameras."""
+    """Return the age of a frame from each camera; None if none arrived in time. Waits only for cameras in ``shown``."""
     deadline = time.monotonic() + timeout_s
     ages: dict[str, float | None] = {camera.name: None for camera in drone.capabilities.cameras}
     came = {name: threading.Event() for name in ages}

@@ -141,7 +141,7 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, even after the proxy restarts."""
+        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, also after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")

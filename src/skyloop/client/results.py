@@ -176,12 +176,12 @@ class ResultMailbox:
 
     @property
     def dropped(self) -> int:
-        """Results that were replaced by newer ones or too old."""
+        """Number of results that were replaced by newer ones or were too old."""
         return self.expired + sum(mailbox.dropped for mailbox in self._mailboxes.values())
 
 
 def is_old(result: Result, max_age_s: float | None) -> bool:
-    """Return whether a result is now older than ``max_age_s``; False for None."""
+    """Return whether a result is now older than ``max_age_s``; always False if that is None."""
     return max_age_s is not None and result.age_s > max_age_s
 
 
@@ -305,7 +305,7 @@ class ResultChannels:
             self.everything.publish(result)
 
     def _make_room(self) -> None:
-        """Forget channels without consumers, oldest first, while there are too many: programs may invent names."""
+        """Forget channels without consumers, oldest first, if there are too many: programs may use invented names."""
         with self._lock:
             unused = [name for name, one in self._channels.items() if not one.subscribed]
             surplus = len(self._channels) + 1 - MAX_CHANNELS

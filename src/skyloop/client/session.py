@@ -74,7 +74,7 @@ class Requests:
         if failed is not None:
             done(failed)
         else:
-            self._send(packet)  # tick() repeats it if it can't be handed over now
+            self._send(packet)  # if it can't be handed over now, tick() sends it again
 
     def answered(self, reply: Reply) -> bool:
         """Handle an answer; return False if the request is unknown or has timed out."""
@@ -101,7 +101,7 @@ class Requests:
             pending.done(NoAnswerError(f"the proxy did not answer {pending.what} within {pending.timeout_s:g} s"))
 
     def fail(self, error: LinkError) -> None:
-        """Answer all present and future requests with ``error``, because the connection is gone."""
+        """Answer all pending and future requests with ``error``, because the connection is gone."""
         with self._lock:
             self._failed = error
             pending, self._pending = list(self._pending.values()), {}
@@ -110,7 +110,7 @@ class Requests:
 
 
 PING_S: Final = 1.0  #: time limit for a ping
-FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
+FEEDBACK_STALL_S: Final = 1.0  #: time without feedback, although the proxy responds, after which to resubscribe
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock if it differs from ours
 _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval while there have been only a few round trips
@@ -144,21 +144,21 @@ class ProxySession:
         self._poke = poke
         self._clock = clock
         self.open = True  #: whether neither end has closed the session
-        self._quiet = False  # closed by this end, so later arrivals are ignored
+        self._quiet = False  # this end has closed the session, so later arrivals are ignored
         self._up = False
         self._pinged_ns = 0
         self._pinged = False  # a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # for each of the transport's topics, the topics that it serves
+        self._video_users: dict[str, set[str]] = {}  # the topics that each of the transport's topics serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # the form in which feedback arrives in this session
-        self._only_plain = False  # the proxy sends no other form
+        self._feedback = PLAIN  # the variant of feedback that arrives in this session
+        self._only_plain = False  # whether the proxy offers no other variant
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock minus ours
-        self.closed_reason: str | None = None  #: why it ended, once it has
+        self.closed_reason: str | None = None  #: why the session ended; None while it has not
         self.receiver = 0  #: identity of the receiving thread
         self.look_ns = 0  #: when the supervisor next evaluates its state
         self._end = dial(self)  # must be last, because packets may arrive at once
@@ -178,7 +178,7 @@ class ProxySession:
             self.offset_ns = self._trips.add(sent_ns, welcome.now_ns, self._clock()).ns
 
     def close(self, error: LinkError) -> None:
-        """End the session; unanswered requests get ``error``."""
+        """End the session and fail unanswered requests with ``error``."""
         self._quiet, self.open = True, False
         self._end.close()
         self.requests.fail(error)
@@ -197,7 +197,7 @@ class ProxySession:
 
     @property
     def transmit(self) -> Callable[[bytes], bool]:
-        """The transport's own send function, without another layer, for frequent packets."""
+        """The send function of the transport itself, without another layer, for frequent packets."""
         return self._end.send
 
     def send(self, packet: bytes) -> bool:
@@ -233,7 +233,7 @@ class ProxySession:
     def tick(self, now_ns: int) -> None:
         """Repeat due requests, and ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
-        late_ns = self.monitor.late_ns  # silence after which the proxy is pinged
+        late_ns = self.monitor.late_ns  # time without data after which the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
@@ -259,7 +259,7 @@ class ProxySession:
         self._end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
-        """Evaluate the link by the new feedback rate from now on."""
+        """From now on, evaluate the link by the new feedback rate."""
         if request == self._feedback:
             return
         now_ns, self._feedback = self._clock(), request
@@ -299,7 +299,7 @@ class ProxySession:
                     self._poke()
             return
         handler = self._handlers.get(type(sample))
-        if handler is None:  # a kind that proxies do not send
+        if handler is None:  # proxies do not send this kind of sample
             self._malformed()
             return
         self.monitor.received_ns = now_ns
@@ -308,7 +308,7 @@ class ProxySession:
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         """Check a frame's size and pass it on; on the receiving thread.
 
-        ``topic`` is the request that it answers; empty: a plain frame of the camera.
+        ``topic`` is the request that the frame answers; empty for a plain frame of the camera.
         """
         now_ns = self._clock()
         if self._quiet:
@@ -343,7 +343,7 @@ def frame_size(header: FrameHeader) -> int:
 def _carrier(topic: str, *, variants: bool) -> str:
     """Return the transport's topic that carries this video.
 
-    ``variants``: whether the transport carries frames in the requested form. If not, all frames arrive unchanged, and
+    ``variants``: whether the transport carries frames in the format requested. If not, all frames arrive unchanged, and
     each channel filters and scales them itself.
     """
     request = VideoRequest.parse(topic)

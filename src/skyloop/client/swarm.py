@@ -389,7 +389,7 @@ class Swarm:
         """Cut the motors of all drones at once, including those set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some, whatever ``on_error`` is.
+            SwarmError: If the command could not be sent to some drones, whatever the value of ``on_error``.
         """
         sent, errors = _try_all(self._drones, lambda drone: drone.emergency_stop())
         errors |= {name: _not_sent(self._drones[name]) for name, handed in sent.items() if not handed}
@@ -404,7 +404,7 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone that it is for, sending them all at once.
 
-        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        Drones that are set aside are left out. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -425,14 +425,14 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        # Wait a few milliseconds at most until every drone can send a set-point at once, so that all are sent together.
+        # Wait at most a few milliseconds until every drone can send a set-point at once, so that all are sent together.
         open_ns = max((drone._commands.schedule.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
             action, commands = actions[name], ready[name]._commands
-            if type(action) is Hover:  # hovering the swarm must not take a drone from its safety pilot
+            if type(action) is Hover:  # a hover of the whole swarm must not take a drone from its safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
@@ -453,11 +453,11 @@ class Swarm:
         """Call ``function`` with each active drone in a separate thread, and wait for all.
 
         Args:
-            function: If it raises a :class:`SkyloopError`, its drone has failed; any other exception is re-raised here.
+            function: A :class:`SkyloopError` raised by it fails the drone; any other exception is re-raised here.
             what: Name of the action in error messages; empty: the function's name.
 
         Returns:
-            Its results by name.
+            The results of the calls, by name of the drone.
         """
         self._check_open()
 
@@ -479,7 +479,7 @@ class Swarm:
     ) -> dict[str, AuthorityStatus]:
         """Request the authority over all active drones; return the status of each, by name.
 
-        Arguments are those of :meth:`Drone.request_authority`.
+        The arguments are those of :meth:`Drone.request_authority`.
         """
         return self.each(
             lambda drone: drone.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay),
@@ -506,7 +506,7 @@ class Swarm:
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that don't meet it have failed.
 
         Args:
             wanted: A flight state or its name, several of these, or a predicate on feedback.
@@ -563,7 +563,7 @@ class Swarm:
                 yield Tick(count, due_s - begun_s, late_s)
                 count += 1
                 due_s = max(due_s + period_s, time.monotonic())
-        finally:  # a break or an exception in the loop drops this generator, which runs this at once
+        finally:  # if the loop ends by a break or an exception, this generator is dropped, and this runs at once
             for drone in self:
                 if isinstance(drone._commands.newest, Velocity | Attitude):
                     drone._piloting.let_go("the loop that flew it has ended")
@@ -716,7 +716,7 @@ def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError |
         def ended() -> SkyloopError | None:
             try:
                 return end(drone)
-            except GivenUpError:  # no caller is waiting for it any more
+            except GivenUpError:  # no caller is waiting for the result any more
                 return None
 
         return ended
@@ -736,13 +736,13 @@ def in_parallel(
 ) -> tuple[dict[str, T], dict[str, Exception]]:
     """Run all jobs, by name, at the same time, each in its own thread, and wait until all have ended.
 
-    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or
-    ``interrupted`` once set, ends the jobs' waits for commands, see :data:`skyloop.client.commands.cancelled`; their
-    other work ends normally.
+    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or setting
+    ``interrupted``, ends the jobs' waits for commands (see :data:`skyloop.client.commands.cancelled`); their other work
+    ends normally.
 
     Returns:
         The result of each job, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
-        re-raised here when all have ended.
+        re-raised here after all jobs have ended.
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
@@ -769,7 +769,7 @@ def in_parallel(
         for name in left:
             copy_context().run(work, name, jobs[name])
             if not isinstance(raised.get(name), Exception | None):
-                raise raised[name]  # Ctrl-C, on this thread: start nothing else
+                raise raised[name]  # Ctrl-C on this thread: don't start any more jobs
         for thread in threads:
             thread.join()
     except BaseException:  # Ctrl-C: a take-off must not be executed later

@@ -75,7 +75,7 @@ class Mailboxes:
     ) -> None:
         """Create empty mailboxes as requested; see :class:`skyloop.extend.InboxOptions`.
 
-        Raises the errors of :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
+        Raises the same errors as :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
         """
         known = state.results
         named = [known.everything] if processors is None else [known.channel(one) for one in processors]
@@ -108,7 +108,7 @@ class Mailboxes:
         return self.feedback.waiting or self.frames.waiting or self.results.waiting
 
     def frame(self) -> Frame | None:
-        """Take the newest frame; None if it was already taken, none arrived, or it can't be decoded."""
+        """Return the newest frame and empty the mailbox; None if no new frame arrived or it can't be decoded."""
         arrival, video = self.frames.take(), self._video
         if arrival is None or video is None:
             return None
@@ -196,9 +196,9 @@ class ClientState:
         self.to_close: list[Callable[[], None]] = []  #: functions that release resources when the drone is closed
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
-        self.received_ns = 0  #: when the newest feedback arrived, on our clock
+        self.received_ns = 0  #: when the newest feedback arrived, on this process's clock
         self.history = FeedbackHistory()
-        #: Notified with each feedback, and with every change that a thread may wait for.
+        #: Notified on each feedback sample, and on every change that a thread may be waiting for.
         self.notifier = scheduler.notifier()
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
@@ -216,7 +216,7 @@ class ClientState:
         self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
         self.overview: Overview | None = None  #: the newest complete overview
         self.on_share: Channel[ProcessorShare] = Channel()
-        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; published on the supervisor's thread
+        self.on_welcome: Channel[Welcome] = Channel()  #: publishes each new connection, on the supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
@@ -258,7 +258,7 @@ class ClientState:
         return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
-        """Return the channel of feedback as requested, creating it on the first call."""
+        """Return the channel that delivers feedback as requested, creating it on the first call."""
         if request.is_plain:
             return self.on_feedback
         with self._making:
@@ -277,7 +277,7 @@ class ClientState:
         self.notifier.notify()
 
     def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
-        """Return the statistics of every channel by its name; ``sends`` counts the commands sent."""
+        """Return the statistics of every channel, by name; ``sends`` counts the commands that were sent."""
         now_ns = self._clock()
         echoes = self.echoes.stats(now_ns)
         found = {
@@ -349,7 +349,7 @@ class SessionSamples:
         state.on_welcome.publish(welcome)
 
     def link_changed(self, state: LinkState, reason: str) -> None:
-        """Publish the state of the hop to the proxy, and an event."""
+        """Publish the state of the hop to the proxy, along with an event."""
         severity = Severity.INFO if state in (LinkState.UP, LinkState.CLOSED) else Severity.WARNING
         text = f"link to the proxy: {state.value}" + (f" ({reason})" if reason else "")
         self._state.set_status(replace(self._state.status, application=state, reason=reason))
@@ -361,13 +361,13 @@ class SessionSamples:
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
-        """Store and publish a sample of feedback, then update the statistics, the authority and the link's state."""
+        """Store and publish a feedback sample, then update the statistics, the authority and the link's state."""
         state = self._state
         before = state.newest
         state.history.add(sample)
         state.newest = sample
         state.received_ns = now_ns
-        # A failsafe or another owner ends the set-point, but not a command that a listener sends on this sample.
+        # A failsafe or another owner clears the set-point, but no command that a listener sends because of this sample.
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)

@@ -44,7 +44,7 @@ from skyloop.messages.parameter import Diagnostic
 class Sink(Protocol):
     """Receives a driver's feedback, frames, link states and events.
 
-    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is a time of
+    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is on the clock of
     ``time.monotonic_ns`` on this host.
     """
 
@@ -67,7 +67,7 @@ class Sink(Protocol):
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a whole frame.
+        """Publish a complete frame.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
@@ -100,20 +100,20 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a frame as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
         Size, time and intrinsics are the same as those of the decoded frame. While frames are in use, the decoded frame
         is also passed to :meth:`frame`.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
-            data: One undamaged H.264 access unit in Annex B format, from a stream without B pictures. Key pictures
-                include SPS and PPS. Any other picture must continue the one passed before it: after a gap, or after a
+            data: One undamaged H.264 access unit in Annex B format, from a stream without B-frames. Key frames
+                include SPS and PPS. Any other frame must continue the one passed before it: after a gap, or after a
                 period without receivers, start with a key frame.
-            captured_ns: When the picture was captured, on this host's monotonic clock.
+            captured_ns: When the frame was captured, on this host's monotonic clock.
             width: Width [px].
             height: Height [px].
-            key: Whether decoding can start with this picture.
+            key: Whether decoding can start with this frame.
             intrinsics: Intrinsics for this size; None if unknown.
         """
 
@@ -150,7 +150,7 @@ class ServedLink(Protocol):
         """Do all pending work without waiting. Errors raised are already reported; the host retries after a pause.
 
         Args:
-            readable: Whether :meth:`fileno` is readable; if not, the time last returned has come.
+            readable: Whether :meth:`fileno` is readable; if not, the deadline returned last has passed.
 
         Returns:
             Deadline of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
@@ -203,7 +203,7 @@ class Driver(ABC):
         uri: The vehicle's address with its options.
 
     Attributes:
-        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is theirs and left alone.
+        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is considered theirs.
         parameters_without_authority: Names of parameters that any pilot may write, because they don't affect a flight.
         serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
             its own thread.
@@ -219,7 +219,7 @@ class Driver(ABC):
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. Subclasses read their options here, without I/O."""
         self.uri = uri
-        self.__lock = threading.Lock()  # private to this class, because subclasses may have their own _lock
+        self.__lock = threading.Lock()  # name-mangled, because subclasses may have a _lock of their own
         self._sink: Sink | None = None
 
     # Abilities ------------------------------------------------------------------------------------------------
@@ -232,7 +232,7 @@ class Driver(ABC):
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return those of the vehicle's own parameters that are known so far, with their present values.
+        """Return those of the vehicle's own parameters that are known so far, with their current values.
 
         Names are dotted and lower-case. May be called before the vehicle has answered.
         """
@@ -282,7 +282,7 @@ class Driver(ABC):
     def close(self) -> None:
         """Stop threads and release resources. Idempotent.
 
-        Does not land the vehicle: the proxy does so beforehand. The sink is not called after this returns.
+        Does not land the vehicle, because the proxy has done so before. The sink is not called after this returns.
         """
         with self.__lock:
             was_open, self._sink = self._sink is not None, None
@@ -327,11 +327,11 @@ class Driver(ABC):
     def left_to(self) -> str:
         """Return what others have made the vehicle do since our last command, such as ``RTL``.
 
-        Override this if the vehicle reports it. The proxy calls it several times a second, and leaves a vehicle flown
-        by others alone until a new action takes it over. Thread-safe; returns at once.
+        Override this if the vehicle reports who controls it. The proxy calls it several times a second. A vehicle flown
+        by others is left alone until a new action takes it over. Thread-safe; returns at once.
 
         Returns:
-            The driver's word for it; empty if others have done nothing.
+            The driver's name for it; empty if others have done nothing.
         """
         return ""
 

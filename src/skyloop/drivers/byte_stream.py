@@ -41,7 +41,7 @@ class Rank(IntEnum):
     POSE = 4  #: external poses, which are frequent and large
 
 
-#: Maximum lag of the line at which packets of a rank are still sent [ns].
+#: Maximum backlog of the line at which packets of a rank are still sent [ns].
 _PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(0.06), Rank.POSE: nanoseconds(0.02)}
 
 
@@ -57,7 +57,7 @@ class LinePace:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
         self._free_ns = 0  # when all bytes written so far will have been sent
-        self._written = 0  # total number of bytes written
+        self._written = 0  # number of bytes written so far
         self._mark = 0  # how many of these should have been sent by _due_ns
         self._due_ns: int | None = None  # when those bytes should have been sent; None if there were none
 
@@ -70,7 +70,7 @@ class LinePace:
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
-        """Update with the number of bytes written that are still in the output buffer."""
+        """Update the estimate with the number of written bytes that are still in the output buffer."""
         if not size:
             self._due_ns = None
         elif self._due_ns is None or self._written - size >= self._mark:
@@ -78,7 +78,7 @@ class LinePace:
         self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
-        """Update with the number of bytes written."""
+        """Update the estimate with the number of bytes just written."""
         self._free_ns = max(self._free_ns, now_ns) + round(size * self._ns_per_byte)
         self._written += size
 
@@ -90,8 +90,8 @@ class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
     ``dropped`` counts packets that were not sent because the line lagged, was stalled, or had no room. Drivers repeat
-    each of them, or send a newer one. Buffers at the far end, and those of pseudo-terminals, which the system reports
-    as empty, are invisible here; therefore sessions hold set-points back while they receive nothing.
+    each of these packets or send a newer one. Buffers at the far end, and those of pseudo-terminals (which the system
+    reports as empty), are not visible here, so sessions hold set-points back while they receive nothing.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
@@ -103,7 +103,7 @@ class ByteStream(ABC):
         self._full_ns: int | None = None  # when the buffer became full, or the line stalled
         self._whole = _LONGEST  # number of bytes written since a frame may have been cut
         self._rest = b""  # end of a frame that was only partly written, altered so that the receiver discards it
-        self._cleared = False  # a full buffer was emptied for a stop, with no sign yet that it is read again
+        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows yet that it is being read again
         self._after_stop = 1 << 62  # bytes written since a stop; if at most this many are waiting, the stop has left
 
     @abstractmethod
@@ -112,16 +112,16 @@ class ByteStream(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return the received bytes, possibly none. Raises ``OSError`` if the connection has ended."""
+        """Return the bytes received so far, which may be none. Raises ``OSError`` if the connection has ended."""
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
-        """Send a packet, or drop it if there is no room or the line lags. Never waits.
+        """Send a packet, or drop it if there is no room or the line has a backlog. Never waits.
 
-        Raises ``OSError`` if it can't be sent, or no whole packet could be sent for :data:`STUCK_NS`.
+        Raises ``OSError`` if sending fails, or if no whole packet could be sent for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and _LONGEST < waiting <= self._after_stop:  # with less waiting, padding takes as long
+        if stop and _LONGEST < waiting <= self._after_stop:  # if less is waiting, padding takes just as long
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent, whole = 0, False
@@ -147,9 +147,9 @@ class ByteStream(ABC):
     def _rest_of(self, packet: bytes, sent: int) -> bytes:
         """Return the bytes to write before the next packet: the end of a frame whose start was sent.
 
-        That frame is outdated. Its last byte, part of a checksum, is inverted so that the receiver discards it; without
-        the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores signatures
-        still executes a signed frame if only its signature was cut.)
+        That frame is out of date. Its last byte, part of a checksum, is inverted so that the receiver discards it;
+        without the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores
+        signatures still executes a signed frame if only its signature was cut.)
         """
         if sent <= len(self._rest):
             return self._rest[sent:]
@@ -177,13 +177,13 @@ class ByteStream(ABC):
         return 0
 
     def _discard(self) -> bool:
-        """Empty the output buffer, which may cut a frame; return whether, as far as is known, it worked."""
+        """Empty the output buffer, which may cut off a frame; return whether this worked, as far as is known."""
         return False
 
     def _drain(self) -> bool:
-        """Wait briefly until written bytes have been sent; return whether they have."""
+        """Wait briefly for written bytes to be sent; return whether they have been."""
         until_s = time.monotonic() + self.drain_s
-        # On a stuck line only a stop is worth waiting for: the buffer was emptied for it, so it may still be sent.
+        # On a stuck line, only a stop is worth waiting for: it may still be sent since the buffer was emptied for it.
         patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
         while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -209,7 +209,7 @@ class TcpStream(ByteStream):
         self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # TCP needs 0.6 s for a packet that is lost twice
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # missing on macOS
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # not available on macOS
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
 
@@ -262,7 +262,7 @@ class SerialStream(ByteStream):
         super().__init__(LinePace(line_speed(path, baud)), clock)
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         self._discard()
-        self._whole = 0  # the previous connection may have cut a frame
+        self._whole = 0  # the previous connection may have left a frame incomplete
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -291,7 +291,7 @@ class SerialStream(ByteStream):
         before = self._waiting()
         with suppress(Exception):  # termios.error is not an OSError
             self._port.reset_output_buffer()
-            if not before or self._waiting() < before:  # not every port driver can empty it
+            if not before or self._waiting() < before:  # some port drivers can't empty it
                 self._whole, self._rest = 0, b""
                 return True
         return False

@@ -29,11 +29,11 @@ class Sequence:
     """The relevant fields of a sequence parameter set."""
 
     frame_number_bits: int
-    width: int  #: width of the displayed picture [px]
+    width: int  #: width of the displayed image [px]
     height: int
     interlaced: bool = False  #: whether pictures may be fields
-    colour_planes: bool = False  #: whether the colour planes are coded separately
-    gaps_allowed: bool = False  #: whether the sender may leave out pictures, so that their numbers have gaps
+    colour_planes: bool = False  #: whether the colour planes are encoded separately
+    gaps_allowed: bool = False  #: whether the sender may skip frames, so that their numbers have gaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Slice:
     """The fields at the start of a slice header."""
 
     is_key: bool
-    is_first: bool  #: whether it is the first slice of its picture
+    is_first: bool  #: whether it is the first slice of its frame
     is_reference: bool
     frame_number: int
     is_b: bool = False  #: whether it may refer to later frames
@@ -110,7 +110,7 @@ def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
 
 
 def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
-    """Return how many reference pictures are missing between two consecutive ones, by their numbers (7.4.3)."""
+    """Return how many reference frames are missing between two consecutive ones, according to their numbers (7.4.3)."""
     if now.is_key:
         return 0
     turns = 1 << sequence.frame_number_bits
@@ -169,24 +169,24 @@ class Unit:
 
     data: bytes  #: the unit in Annex B format; if it is a key frame, it includes the parameter sets
     is_key: bool  #: whether decoding can start here: it is an IDR picture with known parameter sets
-    after_gap: bool  #: whether pictures are missing before this one, or it is the first
+    after_gap: bool  #: whether frames are missing before this one, or it is the first
     width: int  #: width [px]
     height: int
-    reason: str = ""  #: why pictures of this stream can't be forwarded undecoded; empty if they can
+    reason: str = ""  #: why frames of this stream can't be forwarded without decoding; empty if they can
 
 
 class Inspector:
     """Inspects the access units of one stream in order, without decoding them.
 
-    It remembers parameter sets, which a stream may send only once, and puts them in front of each key picture. If a
+    It remembers parameter sets, which a stream may send only once, and puts them in front of each key frame. If a
     stream has several sequence parameter sets, the last one is used.
 
     Args:
-        parameters: Parameter sets from outside the stream (SDP or a container), in Annex B format.
+        parameters: Parameter sets obtained outside the stream (from SDP or a container), in Annex B format.
     """
 
     def __init__(self, parameters: bytes = b"") -> None:
-        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # by type and number of the set
+        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # parameter sets by type and number
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         for unit in units(parameters):
@@ -222,7 +222,7 @@ class Inspector:
         return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
 
     def restart(self) -> None:
-        """Record that pictures were left out, so that the next one does not continue the last."""
+        """Record that frames were skipped, so that the next one does not continue the last one."""
         self._before = None
 
     def _is_missing(self, before: Slice, now: Slice) -> bool:
@@ -256,7 +256,7 @@ class Inspector:
 
 
 def _set_number(unit: bytes) -> bytes:
-    """Return the number of a parameter set, which is the key it is stored under."""
+    """Return the number of a parameter set, which identifies it."""
     bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
     try:
         return bytes([bits.exp_golomb() % 256])

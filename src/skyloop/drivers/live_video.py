@@ -1,7 +1,7 @@
-"""Receive a vehicle's live video, decode it, and show the newest picture; forward H.264 undecoded.
+"""Receive a vehicle's live video, decode it, and show the newest frame; forward H.264 without decoding.
 
 One thread reads frames from the socket as they arrive, so that they don't grow old in a kernel buffer, and keeps
-reconnecting. Another one decodes the frames that are wanted. Between these two threads, the :class:`FrameBacklog`
+reconnecting. Another thread decodes the frames that are wanted. Between these two threads, the :class:`FrameBacklog`
 decides which frames to drop when decoding falls behind.
 """
 
@@ -51,7 +51,7 @@ class FrameBacklog:
     only the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
     subscriber gets an image at once.
 
-    ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
+    ``skipped`` is the number of frames that were wanted but not shown, because newer ones had arrived.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class FrameBacklog:
         return len(self._frames)
 
     def put(self, frame: Coded, *, wanted: bool) -> None:
-        """Add a received frame."""
+        """Add a frame that has just been received."""
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
@@ -89,7 +89,7 @@ class FrameBacklog:
 
 
 class Decoded(NamedTuple):
-    """A decoded picture."""
+    """A decoded frame."""
 
     number: int  #: the number that the vehicle gave this frame
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
@@ -139,21 +139,21 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture from the vehicle's selected camera."""
+    """A frame from the vehicle's selected camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
     width: int  #: width [px]
     height: int
     captured_ns: int  #: capture time on this host's monotonic clock; arrival time if the vehicle sends no timestamps
-    number: int  #: number that the vehicle gave the picture, 32 bits
+    number: int  #: number that the vehicle gave the frame, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Publish the picture as a frame of a camera."""
+        """Publish this as a frame of a camera."""
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
 class VideoEvent(Enum):
-    """What a receiver reports besides pictures."""
+    """Events that a receiver reports."""
 
     STREAMING = "streaming"  #: frames are arriving
     LOST = "lost"  #: there is no connection any more, or none yet; reported once per reason, and retried forever
@@ -195,19 +195,19 @@ class VideoCounters:
 class LiveVideo:
     """The video of one vehicle.
 
-    While no pictures are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame
-    are kept, so that a new subscriber gets a picture at once. Nothing is sent or received before :meth:`start`.
+    While no frames are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame are
+    kept, so that a new subscriber gets an image at once. Nothing is sent or received before :meth:`start`.
 
     Args:
         place: Human-readable description of where the video comes from.
         connect: Opens a connection, given its number from 0; raises OSError on failure. On the reading thread.
-        make_decoder: Creates the decoder; raises MissingExtraError if none is installed. Called on the thread that
-            calls :meth:`start`.
-        show: Called with each picture on the decoding thread; must return quickly.
+        make_decoder: Creates the decoder; raises MissingExtraError if no decoder is installed. Called on the thread
+            that calls :meth:`start`.
+        show: Called with each frame on the decoding thread; must return quickly.
         on_event: Called with each event and its text on either thread; must return quickly.
         wants: Returns whether decoded frames are wanted. Called on the reading thread.
-        wants_checked: Returns whether to decode frames even if pictures aren't wanted, because the decoder forwards
-            whole ones. Called on the reading thread.
+        wants_checked: Returns whether to decode frames even if none are wanted, because undamaged ones are forwarded.
+            Called on the reading thread.
         came: Called on the reading thread with every whole frame as it arrives.
         clock: A monotonic clock [ns].
         name: Name of the reading thread, and prefix of the decoding thread's name.
@@ -241,8 +241,8 @@ class LiveVideo:
         self._stop = threading.Event()
         self._changed = threading.Condition()  # guards the backlog and the counts of the reading thread
         self._backlog = FrameBacklog()
-        self._wanted = False  # whether frames were wanted when the last one arrived
-        self._shows = False  # whether pictures are wanted, rather than only decoded for the check
+        self._wanted = False  # whether frames were wanted when the last frame arrived
+        self._shows = False  # whether frames are wanted, and not only decoded as a check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -264,7 +264,7 @@ class LiveVideo:
     def stop(self) -> None:
         """Stop both threads. Idempotent; no callback runs afterwards, unless this is called from one.
 
-        Takes up to 4 s; a connection that takes longer to open or read is abandoned to end by itself.
+        Takes up to 4 s; a connection that takes longer to open or read is left to end by itself.
         """
         self._stop.set()
         with self._changed:
@@ -378,7 +378,7 @@ class LiveVideo:
                     self._emit(VideoEvent.FAULT, reported)
 
     def _next(self) -> tuple[Coded, bool] | None:
-        """Wait until there is a frame to decode. Return the frame and whether to show it; None after :meth:`stop`."""
+        """Wait for a frame to decode. Return the frame and whether to show it; None after :meth:`stop`."""
         with self._changed:
             self._changed.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             if self._stop.is_set():
@@ -392,7 +392,7 @@ class LiveVideo:
 
 
 class StreamRelay:
-    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
+    """Forwards H.264 while it is wanted, starting with a key frame and restarting with one after a gap.
 
     Works the same whether or not frames are also decoded. Not thread-safe.
     """
@@ -401,23 +401,23 @@ class StreamRelay:
         self._sink = sink
         self._intrinsics = intrinsics
         self._chain = Chain()
-        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
+        self._source: tuple[str, int] | None = None  # camera and connection of the previous frame
 
     def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
+        """Return whether a camera's stream is wanted. If not, it will restart with a key frame."""
         wanted = self._sink.wants_stream(camera)
         if not wanted:
             self.restart()
         return wanted
 
     def restart(self) -> None:
-        """Restart with the next key picture."""
+        """Restart with the next key frame."""
         self._source = None
 
     def take(
         self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
     ) -> bool:
-        """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
+        """Forward an undamaged frame if it is wanted and can be decoded after the last one; return whether it was.
 
         ``captured_ns`` is the same as in the decoded frame. ``number`` counts the frames received on the connection, so
         skipped ones show as gaps. ``picture``: False if the unit contains only parameters, which are not forwarded.
@@ -443,7 +443,7 @@ class StreamRelay:
 
 
 class CheckedRelay:
-    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
+    """Forwards the H.264 of a camera whose stream is not known in advance; reports once why if it can't.
 
     Not thread-safe.
     """
@@ -453,13 +453,13 @@ class CheckedRelay:
         self._sink = sink
         self._camera = camera
         self._where = where
-        self._refused = (-1, "")  # number of the connection, and the reason
+        self._refused = (-1, "")  # number of the refused connection, and the reason
         self._waited = 0
         self._reported = ""
 
     @property
     def wanted(self) -> bool:
-        """Whether the stream is wanted."""
+        """Whether anyone currently wants the stream."""
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:

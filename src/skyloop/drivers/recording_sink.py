@@ -46,7 +46,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A picture as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
+    """A frame as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
@@ -64,9 +64,9 @@ class RecordingSink:
 
     Args:
         watch: Names of the cameras whose frames are wanted; None: all.
-        keep: How many feedback samples, frames, pictures and events to keep; at most 64 frames with pixels.
+        keep: How many feedback samples, frames, encoded frames and events to keep; at most 64 frames with pixels.
         keep_pixels: Whether to keep a copy of the pixels of each frame.
-        record: Whether encoded pictures are wanted, from every camera.
+        record: Whether encoded frames are wanted, from every camera.
     """
 
     def __init__(
@@ -180,9 +180,9 @@ class RecordingSink:
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until a condition holds; return False if it does not within ``timeout_s`` [s].
+        """Wait until a condition holds; return False if this takes longer than ``timeout_s`` [s].
 
-        ``condition`` is called after each of the driver's calls, with the sink's lock held.
+        ``condition`` is called after each call by the driver, with the sink's lock held.
         """
         end = time.monotonic() + timeout_s
         with self._changed:
@@ -243,7 +243,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """Describe a sample's numbers that are not finite, or so large that they must have the wrong unit."""
+    """Describe those numbers in a sample that are not finite, or so large that they must have the wrong unit."""
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
         value = getattr(feedback, name)

@@ -67,7 +67,7 @@ _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
 
 class DriverSuite:
-    """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
+    """Base class for a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
 
     For a vehicle that is slower or moves less, override the class attributes below; override :meth:`vehicle_disappears`
     and :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a
@@ -117,7 +117,7 @@ class DriverSuite:
         raise unittest.SkipTest("this suite does not know how to make the vehicle disappear")
 
     def vehicle_appears(self) -> None:
-        """Bring the vehicle back.
+        """Make the vehicle reachable again.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -136,7 +136,7 @@ class DriverSuite:
 
         Args:
             watch: Names of the cameras whose frames are wanted; None: all.
-            record: Whether encoded pictures are wanted.
+            record: Whether encoded frames are wanted.
 
         Yields:
             The open driver and its sink.
@@ -159,7 +159,7 @@ class DriverSuite:
 
     def test_constructor_does_no_io(self) -> None:
         """The constructor starts no threads and opens no descriptors, and close() without open() does nothing."""
-        self.new_driver()  # fill import caches first, because they are not the driver's resources
+        self.new_driver()  # fill the import caches first, because they are not the driver's resources
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
         assert _resources() == before, "a constructor started a thread or opened a descriptor"
@@ -198,7 +198,7 @@ class DriverSuite:
     # Life cycle ----------------------------------------------------------------------------------------------------
 
     def test_close_is_idempotent_and_final(self) -> None:
-        """A second close does nothing, and the sink is not called after the first."""
+        """A second close() does nothing, and the sink is not called after the first one."""
         with self.opened() as (driver, sink):
             sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
             driver.close()
@@ -228,7 +228,7 @@ class DriverSuite:
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
-        with self.opened() as (_, sink):  # from here on, resources that libraries keep for themselves exist
+        with self.opened() as (_, sink):  # libraries have now created the resources that they keep for themselves
             self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
@@ -415,7 +415,7 @@ class DriverSuite:
     def test_flight(self) -> None:
         """The vehicle takes off, moves in both directions along each axis with the right sign, and lands.
 
-        If it supports positions, it also flies to some.
+        If it supports positions, it also flies to some positions.
         """
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
@@ -462,7 +462,7 @@ class DriverSuite:
             self._stands(sink, "a take-off from before the link was back", at_once=True)
 
     def _stands(self, sink: RecordingSink, what: str, *, at_once: bool = False) -> None:
-        """Check that the vehicle stays on the ground for ``stand_s``, after time to land unless ``at_once``."""
+        """Check that the vehicle stays on the ground for ``stand_s``; unless ``at_once``, let it land first."""
         if not at_once:
             time.sleep(1.0)  # time for telemetry to reflect the last command
             sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, self.land_timeout_s)
@@ -526,7 +526,7 @@ class Flight:
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
-        """Begin with an open driver whose link is up; skip the test if it supports no set-points."""
+        """Prepare a flight with an open driver whose link is up; skip the test if it supports no set-points."""
         self.suite = suite
         self.driver = driver
         self.sink = sink
@@ -559,7 +559,7 @@ class Flight:
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
             return
-        self.driver.check(Takeoff())  # as the proxy does before it climbs
+        self.driver.check(Takeoff())  # check as the proxy does before it climbs
         self.set_point(up=self.suite.climb)
         self.until(lambda f: f.altitude_m is None or f.altitude_m > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
         self.set_point()
@@ -579,7 +579,7 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude that goes there.
+        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude to match.
 
         Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. The
         command is sent only once, because the driver must keep it in force.
@@ -592,7 +592,7 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move in both directions along each axis, which is needed to check the sign."""
+        """Move in both directions along each axis, so that the sign can be checked."""
         suite = self.suite
         for sign in (1.0, -1.0):
             self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
@@ -665,7 +665,7 @@ def _turned(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed if the position is unknown."""
+    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed, if there is no position."""
     if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
     east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]

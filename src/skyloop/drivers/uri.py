@@ -34,7 +34,7 @@ class VehicleUri:
         given = dict(options or {})
         broken = is_broken(given)
         self.scheme: Final = scheme  #: the driver's name
-        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
+        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or empty.
         self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
         #: Names and values as given, percent-decoded.
         self.options: Final[Mapping[str, str]] = {

@@ -54,7 +54,7 @@ class NameLookup:
 
     @property
     def answered(self) -> bool:
-        """Whether a pending look-up has finished, so that it is worth calling :meth:`address` again."""
+        """Whether a pending look-up has finished, so that :meth:`address` is worth calling again."""
         return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
@@ -93,7 +93,7 @@ class VehicleLink(ABC, Generic[S]):
     Args:
         name: Name of the thread.
         session: The vehicle's protocol.
-        deliver: Called on the link's thread with the session's callbacks for the sink.
+        deliver: Called on the link's thread with the callbacks that the session has for the sink.
         clock: A monotonic clock [ns].
         family: Address family for looking up the host.
         close_s: How long :meth:`stop` waits for the thread to end.
@@ -166,7 +166,7 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Send a request; return the vehicle's answer, or ``otherwise`` if it is late. Not on the link's thread.
+        """Send a request; return the answer, or ``otherwise`` if none arrives in time. Never on the link's thread.
 
         ``ask`` is called with the lock held, and is given the function to call with the answer.
         """
@@ -187,7 +187,7 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _open_sockets(self) -> None:
-        """Replace the sockets with new ones. On the link's thread, with the lock free.
+        """Replace the sockets with new ones. Called on the link's thread, without holding the lock.
 
         Raises ``OSError`` if they can't be opened; the link retries.
         """
@@ -208,7 +208,7 @@ class VehicleLink(ABC, Generic[S]):
         return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
-        """Do work that has a pace of its own. With the lock held, on the link's thread."""
+        """Do work that has a pace of its own. Do periodic work. Called with the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
         """Call a function on the link's thread, without holding the lock, whenever a source is readable."""
@@ -262,7 +262,7 @@ class VehicleLink(ABC, Generic[S]):
                 self.session.failed(error)
 
     def _step(self, *, wait: bool = True, look: bool = True) -> None:
-        self._renew()  # before the wait, so that no socket is closed between becoming readable and being read
+        self._renew()  # renew sockets before waiting, so that none is closed between becoming readable and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
@@ -322,7 +322,7 @@ class VehicleLink(ABC, Generic[S]):
 
     def _wake(self) -> None:
         """Wake the link's thread. Thread-safe."""
-        with suppress(OSError):  # the thread is awake already, or it has ended
+        with suppress(OSError):  # the thread is already awake or has ended
             self._waker.send(b"\0")
 
     def _drain_wakeups(self) -> None:
@@ -332,7 +332,7 @@ class VehicleLink(ABC, Generic[S]):
 
 
 class ConnectionLink(VehicleLink[S], Generic[S, C]):
-    """A link over one connection, which is reopened when it breaks or stays silent.
+    """A link over one connection, which is reopened when it breaks or delivers nothing.
 
     A subclass for a kind of vehicle implements :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
     """

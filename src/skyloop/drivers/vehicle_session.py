@@ -1,4 +1,4 @@
-"""What the sessions of all vehicles share: the link's state and its reasons, pending events, the emergency stop.
+"""The parts common to all vehicle sessions: the link's state and its reasons, pending events, the emergency stop.
 
 Pure except for :func:`serial_trouble`, which inspects the port's device.
 """
@@ -37,7 +37,7 @@ def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
-    """How long a vehicle may be silent [ns] before its link counts as degraded or lost."""
+    """Time without data [ns] after which a vehicle's link counts as degraded or lost."""
 
     degraded_ns: int
     lost_ns: int
@@ -60,11 +60,11 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
 
 
 class Arrival(Enum):
-    """A packet's place in the order, according to its number."""
+    """How a packet's number relates to those before it."""
 
     NEW = auto()
     LATE = auto()  #: packets with higher numbers arrived before it
-    RESTARTED = auto()  #: the vehicle has restarted, and counts from the start again
+    RESTARTED = auto()  #: the vehicle has restarted and counts from the beginning
 
 
 RESTART_RUN: Final = 5  #: number of consecutive packets with low, increasing numbers that prove a restart
@@ -81,10 +81,10 @@ class RestartWatch:
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
         self._tolerance, self._wrap = tolerance, wrap
         self._newest: int | None = None
-        self._behind: tuple[int, int, int] | None = None  # the last number behind, how many were, arrival of the first
+        self._behind: tuple[int, int, int] | None = None  # last low number, count, arrival of the first
 
     def forget(self) -> None:
-        """Accept the next packet as new, because the vehicle was silent."""
+        """Accept the next packet as new, because nothing was received from the vehicle for a while."""
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
@@ -118,8 +118,8 @@ class VehicleSession(ABC):
     """The protocol between one opened driver and its vehicle. Not thread-safe.
 
     Time is an argument; bytes go in and out. Calls to the proxy's sink are collected as callbacks, which the caller
-    runs while it holds no lock. A subclass for a kind of vehicle sets ``_received_ns`` at each valid packet, and calls
-    :meth:`_check_silence` at each poll.
+    runs without holding any lock. A subclass for a kind of vehicle sets ``_received_ns`` on each valid packet and calls
+    :meth:`_check_silence` on each poll.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
@@ -129,7 +129,7 @@ class VehicleSession(ABC):
         self.link_state: LinkState | None = None  #: the last state reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # when the vehicle was last received; None: not since opening or loss
+        self._received_ns: int | None = None  # when data last arrived; None: not since opening or a loss
         self._unreachable = ""
         self._remedy = ""  # what to do if the vehicle is unreachable
         self._reported_reason = ""
@@ -154,12 +154,12 @@ class VehicleSession(ABC):
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
-        """Record an error of a socket or port, with a remedy for people."""
+        """Record an error of a socket or port, with a remedy for the user."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
     def connected(self) -> None:  # noqa: B027  most connections need nothing
-        """Handle a new connection, after which no data from an older one arrive."""
+        """Handle a new connection; no data from older ones arrive after it."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
         """Handle an open connection that accepts no more data: the vehicle is lost even if it still sends."""
@@ -238,7 +238,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` must be called next; ``latest_ns`` at the latest."""
+        """Return when :meth:`_check_silence` must be called next, but at most ``latest_ns``."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -265,14 +265,14 @@ class VehicleSession(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkTrouble:
-    """Why a vehicle can't be reached."""
+    """The reason why a vehicle can't be reached."""
 
     reason: str  #: what failed; may be empty
     remedy: str = ""  #: an instruction for the user; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
-    """Describe a socket's error."""
+    """Describe the error of a socket."""
     if isinstance(error, socket.gaierror):
         remedy = "correct the name in the address, or join a network where it is known"
         return LinkTrouble(f"its name is unknown: {error.strerror}", remedy)
@@ -325,9 +325,9 @@ SETTLE_NS: Final = nanoseconds(0.5)  #: reports that arrive sooner than this aft
 class MotorStop:
     """One emergency stop of any driver, from the press until it is reset or abandoned.
 
-    A driver knows how to tell that the motors are off, and which bytes stop them; this decides everything else.
-    While it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not the
-    vehicle is sending data, and again every 0.1 s until the vehicle confirms it; until then, the state reported is the
+    A driver knows how to tell that the motors are off and which bytes stop them; everything else is decided here. While
+    it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not the vehicle
+    is sending data, and again every 0.1 s until the vehicle confirms it; until then, the state reported is the
     vehicle's own. If the vehicle has not confirmed it 10 s after the press, the stop is abandoned, because it must not
     be sent minutes later and the vehicle must be free to land. Not thread-safe.
     """
@@ -360,7 +360,7 @@ class MotorStop:
         self._heard_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
-        """Return whether a report received at ``seen_ns`` was certainly sent after the press."""
+        """Return whether a report received at ``seen_ns`` must have been sent after the press."""
         return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
@@ -386,7 +386,7 @@ class MotorStop:
     def reset(self) -> None:
         """Allow the motors to run again. Does nothing if no stop is active.
 
-        Raises :class:`DriverError` if the vehicle has not confirmed the stop, which is still being sent.
+        Raises :class:`DriverError` if the vehicle has not confirmed the stop, in which case it is still being sent.
         """
         if self.active and not self.shown:
             raise DriverError("the motors still run, or are still armed: the stop has not shown yet")

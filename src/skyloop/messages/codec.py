@@ -113,7 +113,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 def packet_kind(packet: bytes | memoryview) -> int:
     """Return a packet's kind, after checking that its header matches its length.
 
-    Raises :class:`DecodeError` if the header is of another version, or does not match the packet.
+    Raises :class:`DecodeError` if the header has a different version or does not match the packet.
     """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")

@@ -17,7 +17,7 @@ from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
 MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is rejected as a mistake [m]
-MAX_YAW_RAD: Final = 1000.0  #: so is a larger yaw [rad]
+MAX_YAW_RAD: Final = 1000.0  #: a yaw larger than this is rejected, too [rad]
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -56,7 +56,7 @@ class Land(Action, frozen=True, array_like=True, tag=3):
 
 
 class EmergencyStop(Action, frozen=True, array_like=True, tag=4):
-    """Cut the motors at once: the vehicle falls. Needs no lease."""
+    """Cut the motors at once: the vehicle falls. No lease is needed."""
 
 
 class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
@@ -181,7 +181,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     """
 
     seq: Count  #: increases with every packet of a connection
-    lease: Count  #: number of the lease it is sent under; 0 if there is none (emergency stop only)
+    lease: Count  #: number of the lease under which it is sent; 0 if there is none (emergency stop only)
     intent: Count  #: increases with each request by the *application*; the library's repeats keep it
     sent_ns: int  #: sending time on the proxy's clock; unchecked, because emergency stops are valid at any time
     action: AnyAction
@@ -243,12 +243,12 @@ ENDINGS: Final[dict[Fate, str]] = {
 
 
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """Fate of the newest intent of the application that is commanding, or was the last to do so."""
+    """Outcome of the newest intent of the application that is commanding or was the last to command."""
 
     app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
     intent: Count = 0  #: number of the intent, as in the commands for it
     fate: Fate = Fate.UNDER_WAY
-    reason: Refusal | None = None  #: why the intent or a repeat of it was refused
+    reason: Refusal | None = None  #: why the intent was refused, or a repeat of it
     text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the reason in readable form
 
     @property

@@ -49,7 +49,7 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
     priority: Priority = DEFAULT_PRIORITY
     queue: bool = True  #: whether to queue for an authority held by another application; False: be refused
-    for_s: Term | None = None  #: how long it is needed after the grant [s]; nil: until it is given back
+    for_s: Term | None = None  #: how long the application needs it after the grant [s]; nil: until it gives it back
     takeover: Takeover = Takeover.NOW
 
 
@@ -189,7 +189,7 @@ class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The request was refused; ``message`` gives the reason in readable form."""
+    """The request was refused; ``message`` is the reason in readable form."""
 
     code: Refusal
     message: str

@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 MAX_LINK_TEXT = 300  #: characters in a text about the vehicle link
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
-#: How ``link_reason`` begins while the vehicle is starting up: its link is connecting or up, but it can't take off yet.
+#: Prefix of ``link_reason`` while the vehicle is starting up: its link is connecting or up, but it can't take off yet.
 WAKING_UP = "still waking up"
 
 NO_POSITION = "the vehicle does not report its position"
-#: How to give a vehicle its position, as advice to someone whose vehicle has none.
+#: Ways to give a vehicle its position, as advice to users whose vehicle has none.
 POSITION_SOURCES = (
     "make it available: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
     "GPS, optical flow or motion capture (docs/motion-capture.md)"
@@ -76,7 +76,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     failsafe: Failsafe = Failsafe.NONE
     link_reason: LinkText = ""  #: why the vehicle link is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
-    others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
+    others: LinkText | None = None  #: who else is flying the vehicle, because of which the proxy leaves it alone
     start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
     skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
@@ -123,7 +123,7 @@ class EarthOrigin(NamedTuple):
 
     @classmethod
     def of(cls, native: Mapping[str, object] | None) -> EarthOrigin | None:
-        """Return the origin from a driver's ``Feedback.native``; None if there is none or it makes no sense."""
+        """Return the origin from a driver's ``Feedback.native``; None if it is missing or its values are invalid."""
         found = [native.get(key) if native else None for key in _KEYS]
         numbers = [float(one) for one in found if isinstance(one, int | float) and math.isfinite(one)]
         if len(numbers) < len(_KEYS) or not (is_on_earth(*numbers[:2]) and numbers[3] > 0.0):
@@ -181,7 +181,7 @@ class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True
     name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of its proxy
     uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: the vehicle's address, truncated if longer
     vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: the vehicle's family
-    can_fly: bool = False  #: whether it accepts commands at all
+    can_fly: bool = False  #: whether the vehicle accepts commands at all
     captured_ns: TimeNs = 0  #: capture time of its newest feedback, on the proxy's clock; 0 if there is none yet
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: remaining charge, 0 to 1
@@ -197,7 +197,7 @@ class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
     return_phase: ReturnPhase = ReturnPhase.NONE
     applications: Count = 0  #: number of connected applications
-    event: Event | None = None  #: the last event, without data; connecting and disconnecting applications don't count
+    event: Event | None = None  #: the last event, without data; applications that connect or disconnect don't count
 
 
 class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
@@ -209,7 +209,7 @@ class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     at_ns: TimeNs  #: time of the overview, on the proxy's clock
     seq: Count  #: increases by one with each overview
     first: Count = 0  #: index of the first row on this page
-    total: Count = 0  #: number of rows on all pages
+    total: Count = 0  #: number of rows on all pages together
     vehicles: tuple[VehicleOverview, ...] = ()
 
 
@@ -238,7 +238,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as from a real vehicle, for benchmarks."""
+    """Return feedback with as many values as a real vehicle sends, for benchmarks."""
     return Feedback(
         captured_ns=captured_ns,
         state=state,

@@ -73,7 +73,7 @@ def encode_checkup(diagnostics: list[Diagnostic]) -> str:
 
 
 def decode_checkup(text: str) -> list[Diagnostic]:
-    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if it holds none."""
+    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if the text does not contain any."""
     return _checkup_decoder.decode(text.encode())
 
 
@@ -119,7 +119,7 @@ class Card(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Start(msgspec.Struct, frozen=True, array_like=True):
-    """Where a vehicle starts: its position and heading."""
+    """The position and heading at which a vehicle starts."""
 
     name: _Name
     position: _Vec
@@ -144,7 +144,7 @@ _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Encode a world as a parameter's text; if it gets too long, leave out the last solids and markers."""
+    """Encode a world as a parameter's text; if it gets too long, omit the last solids and markers."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)

@@ -95,7 +95,7 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
 MAX_CODE: Final = 128  #: characters that identify a processor's code
-MAX_PARTS: Final = 1024  #: maximum number of shares of a camera's frames, one per worker
+MAX_PARTS: Final = 1024  #: maximum number of parts into which a camera's frames are divided, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
 
@@ -108,7 +108,7 @@ class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
     seq: Count  #: number of the frame
     captured_ns: TimeNs  #: capture time of the frame
     made_ns: TimeNs  #: when the result was ready, on the proxy's clock
-    took_ns: Count  #: duration of the worker's ``process`` [ns]
+    took_ns: Count  #: how long the worker's ``process`` took [ns]
     number: Count  #: increases by one with each result of a worker
     payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
     worker: Count = 0  #: number of the sending application; the proxy overwrites it
@@ -122,7 +122,7 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
     part: Count  #: number of this worker's part of the frames, from 0
     #: number of parts; 1: every frame; 0: no frames, because the worker reported that it can't take any
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
-    workers: Count  #: number of workers for this processor and camera, including paused ones
+    workers: Count  #: number of workers for this processor and camera, including those that are paused
 
     def __post_init__(self) -> None:
         if self.part >= max(1, self.parts):

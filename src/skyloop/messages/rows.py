@@ -20,7 +20,7 @@ ACTIONS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
-    """Return the numbers of these names, from :data:`STATE`, in a drone's state; None if any is unknown.
+    """Return the numbers with these names (from :data:`STATE`) in a drone's state; None if any of them is unknown.
 
     Raises :class:`UnknownNameError` for a name that is not in :data:`STATE`.
     """

@@ -1,4 +1,4 @@
-"""Subscribers' requests: the rate of feedback, and the camera, form and rate of video. Pure.
+"""Subscribers' requests: the rate of feedback; the camera, encoding and rate of video. Pure. Pure.
 
 Each request has exactly one topic, so equal requests are encoded once for all their subscribers.
 """
@@ -16,7 +16,7 @@ from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
-MIN_HZ: Final = 0.001  #: lowest rate, one sample in a quarter of an hour, so that the period stays finite
+MIN_HZ: Final = 0.001  #: lowest rate, one sample every quarter of an hour, which keeps the period finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
 TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be too early
@@ -58,7 +58,7 @@ class FeedbackRequest:
 
     @property
     def topic(self) -> str:
-        """The topic to subscribe to: ``feedback``, or for example ``feedback?max_hz=5``."""
+        """The topic to subscribe to: ``feedback`` or, if the rate is limited, for example ``feedback?max_hz=5``."""
         return FEEDBACK if self.max_hz is None else f"{_FEEDBACK_RATE}{self.max_hz:g}"
 
     @property
@@ -175,7 +175,7 @@ class VideoRequest:
     def stream_topic(self) -> str:
         """The topic of the request's H.264, e.g. ``stream/front?kbit_s=500``.
 
-        Without options, it is the vehicle's own stream.
+        Without options, this is the vehicle's own stream.
         """
         variant = self._variant("")
         return f"{_STREAM_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
@@ -187,7 +187,7 @@ class VideoRequest:
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """Parse a video topic. Raises :class:`UsageError` for any other."""
+        """Parse a video topic. Raises :class:`UsageError` for any other topic."""
         prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
         camera, _, variant = topic.removeprefix(prefix).partition("?")
         if not topic.startswith(prefix) or not camera:
@@ -244,7 +244,7 @@ class RateLimiter:
     def in_time(self, at_ns: int) -> bool:
         """Return whether to keep a sample. Call it once for each sample, in order.
 
-        Its time [ns] may be on any clock as long as it is always the same.
+        Its time [ns] may be on any clock, but must always be on the same one.
         """
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
