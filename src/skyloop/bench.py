@@ -297,7 +297,7 @@ class Application:
         self._drone.close()
 
 
-# The bare hand-over -------------------------------------------------------------------------------------------------
+# The bare connection ------------------------------------------------------------------------------------------------
 
 _STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
 _PACKET: Final = struct.Struct("<qqq3d52x")  # the same with a size of zero, and three numbers: 100 bytes, as in Skyloop
@@ -317,7 +317,7 @@ class BareVehicle:
         self._descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
-        self._memory[:] = 1  # map the pages before the first frame, as in Skyloop's slots after their first use
+        self._memory[:] = 1  # map the pages in advance: Skyloop's slots stay mapped after their first use
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
@@ -394,9 +394,9 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
 }
 _TURN_S: Final = 5.0  # duration of one measurement of one kind of connection
 _WARM_UP_S: Final = 0.4  # uncounted start of a measurement, which sets up threads, slots and the connection
-_SETTLE_S: Final = 0.3  # time for the last samples of a turn to arrive
+_SETTLE_S: Final = 0.3  # time for the last samples of a measurement to arrive
 _AHEAD_NS: Final = 50_000_000  # how far in the future the start time is set, so that both processes can start together
-_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the turn
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the measurement
 _GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
@@ -477,7 +477,7 @@ def named(size: tuple[int, int]) -> str:
 
 
 class _Pair:
-    """The two processes of one kind of hand-over."""
+    """The two processes of one kind of connection."""
 
     def __init__(self, kind: str, folder: str) -> None:
         self._kind = kind
@@ -623,7 +623,7 @@ class PhysicsRow(msgspec.Struct, frozen=True):
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Rendering with the sensor's flaws. ``round`` is the time for ``pictures`` images."""
+    """Rendering, including the sensor's flaws. ``round`` is the time for ``pictures`` images."""
 
     cameras: str
     width: int

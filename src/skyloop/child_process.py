@@ -201,7 +201,7 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return, only once, the data that the parent handed over besides the command line; None if there is none."""
+    """Return the data passed by the parent outside the command line, on the first call only; None if there are none."""
     return os.environ.pop(_HANDED, None)
 
 

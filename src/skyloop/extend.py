@@ -73,14 +73,14 @@ class Commands(Protocol):
     def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
 
     def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
-    def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; raises NoAnswerError without a reply
+    def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; may raise NoAnswerError
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
     # Presence of the person flying. While it is required but lacking, set-points are not repeated and new ones are
     # refused. Commands that end a flight are sent once, and emergency stops always work.
     def flown_by_person(self) -> None: ...  #: require their presence from now on
-    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never earlier than before
+    def present_until(self, until_ns: int) -> None: ...  #: a time on this process's clock [ns]; only ever extended
     def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
 
 
@@ -90,7 +90,7 @@ def commands(drone: Drone) -> Commands:
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
-    """Send ``action``, with checked numbers, like :meth:`skyloop.Drone.command`; return the intent's number."""
+    """Send ``action``, whose numbers are valid, like :meth:`skyloop.Drone.command`; return the intent's number."""
     return drone._commands.ask(action)
 
 
@@ -174,7 +174,7 @@ def video_channel(
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
     """Return the channel of a camera's H.264 frames; without options, these are as encoded by the vehicle itself.
 
-    Consumers are called on the receiving thread. Errors are those of :func:`video_channel`.
+    Consumers are called on the receiving thread. Raises the same errors as :func:`video_channel`.
     """
     return drone._state.video.stream(camera, **how)
 
@@ -193,7 +193,7 @@ class InboxOptions(TypedDict, total=False):
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
     """Return mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
 
-    They are a context manager, and fill while it is open. Errors are those of :func:`video_channel`.
+    The mailboxes are a context manager, and fill while it is open. Raises the same errors as :func:`video_channel`.
     """
     from skyloop.client.telemetry import Mailboxes
 

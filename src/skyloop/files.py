@@ -53,7 +53,7 @@ def read_text(path: str | Path, what: str, most: int) -> str:
 
 
 def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
-    """Read a JSON file as a type, like :func:`read_bytes`."""
+    """Read a JSON file as an instance of a type, like :func:`read_bytes`."""
     content = read_bytes(path, what, most)
     try:
         return msgspec.json.decode(decoded(content), type=kind)
@@ -91,7 +91,7 @@ def expand(path: str | Path) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` after the block; on failure ``path`` stays untouched.
 
-    Devices and pipes are written to directly. Raises :class:`UsageError` for an ``OSError``.
+    Devices and pipes are written to directly. Raises :class:`UsageError` in place of ``OSError``.
     """
     place = Path(os.path.realpath(path))  # if it is a link, replace its target and leave the link in place
     special = place.exists() and not place.is_file()

@@ -67,7 +67,7 @@ def camera_in_body(camera: CameraInfo) -> RigidTransform:
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
     """Return a camera's pose when the vehicle is in the state ``feedback`` (``frame.feedback`` for an image).
 
-    ``position`` and errors as for :func:`body_in_world` and :func:`camera_in_body`.
+    ``position`` and errors are the same as for :func:`body_in_world` and :func:`camera_in_body`.
     """
     return body_in_world(feedback, position) * camera_in_body(camera)
 

@@ -60,7 +60,7 @@ _TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate contro
 _BURST_S: Final = 0.15
 _GROWS: Final = 3  # maximum factor by which a variable rate increases at once
 _FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
-_KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
+_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames, although late subscribers request one
 #: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
@@ -70,8 +70,8 @@ class H264Encoder:
 
     H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame. Width
     and height [px] must be even. If the average rate [kbit/s] ``varies``, it may increase up to threefold; x264 fixes
-    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError`
-    without PyAV or x264.
+    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError` if
+    PyAV or x264 is missing.
     """
 
     def __init__(self, width: int, height: int, fps: float, kbit_s: int, *, varies: bool = False) -> None:

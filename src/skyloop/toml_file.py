@@ -61,7 +61,7 @@ class Place:
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if it is not TOML."""
+    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if parsing fails."""
     if _DEEP_KEY.search(text):
         raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:

@@ -99,7 +99,7 @@ class Cylinder:
     name: str = ""
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """Return the wall of a cylinder to stay outside of."""
+        """Return the wall that a vehicle outside the cylinder must not cross."""
         east, north = self.x - place[0], self.y - place[1]
         off = math.hypot(east, north)
         aside = (east / off, north / off) if off > 0.0 else (1.0, 0.0)
@@ -118,7 +118,7 @@ class Cylinder:
         return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two positions crosses it."""
+        """Return whether the straight line between two positions crosses the zone."""
         first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
         if first > last:
             return False
@@ -162,7 +162,7 @@ class Space:
 
     @property
     def thin(self) -> tuple[Zone, ...]:
-        """The zones that are enforced thicker, as originally given."""
+        """The zones that had to be enlarged, as originally given."""
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:

@@ -200,7 +200,7 @@ class Drone:
                 the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
                 reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
@@ -221,7 +221,7 @@ class Drone:
             NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
+            LinkError: If the link is down and ``wait`` is False; the landing is still sent within 0.5 s if possible.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
@@ -273,7 +273,7 @@ class Drone:
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
                 ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
@@ -302,7 +302,7 @@ class Drone:
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
@@ -333,7 +333,7 @@ class Drone:
             stay: Whether to stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
+            The status: held or, if ``stay`` is True, possibly queued, including the position and the expected wait.
 
         Raises:
             AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
@@ -832,18 +832,18 @@ class Swarm:
         A coroutine function. Exceptions, ``what`` and the result are the same as for :meth:`skyloop.Swarm.each`.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
-        """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
+        """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. If an iteration takes longer than a period, the schedule restarts from its end. When the
-        loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or attitudes
-        that it sent hover at once, because no newer ones would follow.
+        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts from its end.
+        When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or
+        attitudes that it sent hover at once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
             seconds: Duration [s]; None: until the loop ends.
 
         Raises:
-            UsageError: If ``rate_hz`` is out of range, at the first iteration.
+            UsageError: If ``rate_hz`` is out of range; raised by the first iteration.
         """
     async def close(self) -> None:
         """End all connections. Does not land. Idempotent.
@@ -882,7 +882,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
-            paths. Drones that are set aside are left out.
+            paths. Drones that are set aside are skipped.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -1077,7 +1077,7 @@ def connect(
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
     has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
-    60 s, it returns even so, and :meth:`Drone.takeoff` waits for the rest of the time.
+    60 s, it returns anyway, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.

@@ -1,6 +1,6 @@
 """An application's actions: checks of their numbers, when they are complete and when they are sent. Pure.
 
-The newest set-point wins: it is sent at once and then repeated at a steady rate on absolute deadlines, unless a newer
+The newest set-point wins: it is sent at once and then repeated at a steady rate with absolute deadlines, unless a newer
 one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
 leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
 """
@@ -227,7 +227,7 @@ class CommandSchedule:
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
         self.automatic = False  #: whether the newest set-point is the library's own
-        self.over: Outcome | None = None  #: how the newest intent ended, once it has
+        self.over: Outcome | None = None  #: how the newest intent ended; None while it has not
         self.owed: Unsent | None = None  #: a one-off request that could not be sent yet
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0

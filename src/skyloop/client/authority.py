@@ -1,4 +1,4 @@
-"""Track this application's authority by replies, events and feedback, and answer requests to hand it over.
+"""Track this application's authority from replies, events and feedback, and answer requests to hand it over.
 
 Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow with each grant.
 """
@@ -78,7 +78,7 @@ class AuthorityStatus:
 
 
 class EndedSessions:
-    """Ended sessions of this process, by run of the proxy and number of the application. Thread-safe.
+    """This process's finished sessions, by run of the proxy and number of the application. Thread-safe.
 
     A proxy may not notice that a session has ended before the next one begins; until then, it still has the authority.
     """
@@ -117,7 +117,7 @@ class AuthorityTracker:
         self.status = AuthorityStatus()
         self.last_request = RequestAuthority()  #: the last request, which is repeated on a new connection
         self.declined = ""  #: why the holder declined
-        #: Whether to request it again automatically after a lost connection, or after losing the lease by silence.
+        #: Whether to request the authority again automatically after losing the connection, or the lease by time-out.
         self.renews = True
         self._lease = 0  #: the newest lease that this application has held on this connection
         self._granted_ns = 0
@@ -129,7 +129,7 @@ class AuthorityTracker:
 
     @property
     def awaited(self) -> bool:
-        """Whether it is requested and, as far as is known, held by no other application."""
+        """Whether the authority is requested and, as far as is known, not held by another application."""
         return self.wanted and (self.status.state == "none" or not self.settled)
 
     @property
@@ -139,7 +139,7 @@ class AuthorityTracker:
 
     @property
     def behind_itself(self) -> bool:
-        """Whether the proxy has only yet to notice that an earlier session of this process has ended."""
+        """Whether the proxy just has not yet noticed that an earlier session of this process has ended."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
@@ -148,7 +148,7 @@ class AuthorityTracker:
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection: older leases are invalid and, after a restart of the proxy, so are our numbers."""
+        """Reset on a new connection: older leases are invalid and, if the proxy was restarted, so are old numbers."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
@@ -172,7 +172,7 @@ class AuthorityTracker:
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
         """Record a grant from a reply, an event or feedback, unless it has been lost in the meantime.
 
-        ``until_ns``: when the lease ends, on the proxy's clock; None: never, or as already known.
+        ``until_ns``: when the lease ends, on the proxy's clock; None: never, or as reported before.
         """
         self.pending = False
         if lease <= self._lease and not self.held:

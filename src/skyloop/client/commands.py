@@ -159,7 +159,7 @@ class CommandSender:
         """Extend the time until which the person flying is known to be present; never shortens it.
 
         After that time, nothing is repeated, no new flight is started and the authority is not requested, so that the
-        proxy considers the pilot absent. Commands that end a flight are still sent once, and emergency stops as always.
+        proxy considers the pilot absent. Commands that end a flight are still sent once, and emergency stops always.
         The sending thread checks this itself, however busy other threads are.
         """
         with self._lock:
@@ -194,7 +194,7 @@ class CommandSender:
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now``, also if the request for the authority has not been answered yet.
             RefusedError: If an emergency stop blocks a one-off action, or any action with ``now``.
-            LinkError: With ``now`` while the link is down.
+            LinkError: If the link is down and ``now`` is True.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
@@ -265,7 +265,7 @@ class CommandSender:
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
-        """Return the outcome of an intent that has ended; None while, as far as is known, it is in progress."""
+        """Return the outcome of an intent that has ended; None while it appears to be in progress."""
         with self._lock:
             if intent != self.schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])

@@ -27,7 +27,7 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
-WAKE_S: Final = 60.0  #: time limit for a vehicle to start up: no driver reports for longer that it is starting
+WAKE_S: Final = 60.0  #: time limit for a vehicle to start up, which no driver exceeds
 #: Entry-point group with a name per address scheme: functions that return a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
 #: Entry-point group for transports to proxies on other hosts: modules that implement :class:`NetworkTransport`.
@@ -128,7 +128,7 @@ def connect(
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
     has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
-    60 s, it returns even so, and :meth:`Drone.takeoff` waits for the rest of the time.
+    60 s, it returns anyway, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -173,7 +173,7 @@ def prepare(
     network: NetworkChoice = None,
     **options: Unpack[DroneOptions],
 ) -> tuple[Drone, float]:
-    """Return an unconnected drone, and the deadline for its connection, on ``time.monotonic``.
+    """Return an unconnected drone and the deadline for connecting it (on ``time.monotonic``).
 
     Starts a private proxy if needed. Arguments and errors are those of :func:`connect`.
     """

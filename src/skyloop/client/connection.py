@@ -67,7 +67,7 @@ class ProxyConnection:
 
     @property
     def connected(self) -> bool:
-        """Whether, as far as is known, a proxy is at the other end and has answered Hello."""
+        """Whether a proxy is at the other end and has answered Hello, as far as is known."""
         session = self.session
         return session is not None and session.open
 
@@ -444,7 +444,7 @@ class Scheduler:
         self.clock = clock
 
     def notifier(self) -> Notifier:
-        """Return a notifier for threads of the application that wait."""
+        """Return a notifier for waiting threads of the application."""
         return Notifier()
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:
@@ -456,4 +456,4 @@ class Scheduler:
         supervisor.attend_for_ever()
 
     def opened(self) -> None:
-        """Handle the end of connecting: the drone's state is known, and a pilot may command it."""
+        """Handle completion of the connection: the drone's state is known, and a pilot may command it."""

@@ -230,7 +230,7 @@ class Drone:
 
         ``timeout_s`` limits the wait for the proxy's answer, for the first feedback and, as a pilot, for the vehicle to
         start up; once the vehicle may be commanded, starting up may take ``wake_s`` if that is longer. With
-        ``acquire=False``, a pilot does not request the authority yet. Errors are those of :func:`skyloop.connect`.
+        ``acquire=False``, a pilot does not request the authority yet. Raises the errors of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -389,7 +389,7 @@ class Drone:
             stay: Whether to stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
+            The status: held or, if ``stay`` is True, possibly queued, including the position and the expected wait.
 
         Raises:
             AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
@@ -440,7 +440,7 @@ class Drone:
                 the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
                 reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
@@ -461,7 +461,7 @@ class Drone:
             NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
+            LinkError: If the link is down and ``wait`` is False; the landing is still sent within 0.5 s if possible.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
@@ -558,7 +558,7 @@ class Drone:
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
                 ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
@@ -592,7 +592,7 @@ class Drone:
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
@@ -1251,7 +1251,7 @@ def open_drone(
     authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
-    """Connect through a dialer, now and again after each loss; applications call :func:`skyloop.connect`.
+    """Connect through a dialer, and reconnect after each loss; applications call :func:`skyloop.connect`.
 
     ``app``: the application's name, 1 to 64 characters. For the rest, see :func:`connect` and :class:`DroneOptions`.
     """

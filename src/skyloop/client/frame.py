@@ -172,8 +172,8 @@ class Arrival:
     ) -> None:
         """Store a frame received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
-        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled when
-        it is decoded: its width and height are multiplied by ``scale``.
+        ``history`` provides the state at the time of capture. When a frame larger than its consumer
+        requested is decoded, its width and height are multiplied by ``scale``.
         """
         self.header = self._full = header
         if scale != 1.0:
@@ -292,7 +292,7 @@ class FeedbackHistory:
         """Return the state at a time on the proxy's clock, its reach [s], and whether there was a sample on each side.
 
         The reach is the time from ``captured_ns`` to the more distant of the samples used. With samples on one side
-        only, the state is the nearest sample unchanged; with none, state and reach are None.
+        only, the state is the nearest sample unchanged; without any, state and reach are None.
         """
         samples = list(self._samples)
         if not samples:

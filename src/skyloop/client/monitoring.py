@@ -27,7 +27,7 @@ class Thresholds:
     silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
     missing_share: float = 0.1  #: fraction of missing or malformed samples that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: malformed packets within a window that make the link lost and reconnected
+    malformed: int = 5  #: malformed packets within a window after which to reconnect
 
 
 @dataclass(frozen=True, slots=True)

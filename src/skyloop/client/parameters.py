@@ -104,7 +104,7 @@ class Config(Mapping[str, Value]):
     """Parameters as a mapping from name to value; each access is a request to the proxy.
 
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
-    restarted proxy forgets written values; they are rewritten with the next grant of the authority, unless another
+    restarted proxy forgets written values; they are written again when the authority is next granted, unless another
     application held it in between. Momentary parameters, such as a flip, are never rewritten. Every method waits for
     the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """

@@ -95,7 +95,7 @@ class Piloting:
     ) -> None:
         """Send the command and, with ``wait``, wait until feedback shows that it is complete; see :meth:`Drone.land`.
 
-        If a take-off is not complete in time, give up control of the vehicle. Do so too if the caller stops waiting,
+        If a take-off is not complete in time, give up control of the vehicle. Do the same if the caller stops waiting,
         for example after Ctrl-C, unless it was waiting for a landing.
         """
         if not wait:
@@ -176,7 +176,7 @@ class Piloting:
     def bring_down(
         self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
-        """If this application flies the vehicle, land and wait for the landing, else let go; see :meth:`end_flight`."""
+        """If this application flies the vehicle, land and wait; otherwise let go of it. See :meth:`end_flight`."""
         self.finish_stop()
         feedback = self._state.newest
         if not self._flies():
@@ -214,7 +214,7 @@ class Piloting:
         return self.closed or newest is None or newest.state in _ENDED_IN
 
     def _others_hands(self) -> str:
-        """Return a text about who has taken over the vehicle from this application; empty if no one has."""
+        """Return who has taken over the vehicle from this application, as readable text; empty if no one has."""
         status, newest = self.commands.status, self._state.newest
         if status.state in ("queued", "preempted"):
             return f"{status.holder or 'another application'} took over"
@@ -269,7 +269,7 @@ class ActionWait:
         return commands.intent != self._intent and not behind
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
-        """Wait until the action is done, until ``deadline_s`` on ``time.monotonic``; errors name ``timeout_s``.
+        """Wait for the action until ``deadline_s`` on ``time.monotonic``; errors name ``timeout_s``.
 
         Raises:
             NoAnswerError: If it is not done in time.
@@ -320,7 +320,7 @@ class ActionWait:
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
             self._note(told.text)  # the text is cleared once a repeat is executed
-            if not told.over:  # it was executed, so holders after that took the vehicle later
+            if not told.over:  # it was executed, so other holders took the vehicle after that
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:

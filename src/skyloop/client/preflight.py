@@ -61,7 +61,7 @@ class PreflightState:
     feedback_age_s: float | None = None
     #: Age of each camera's newest frame; None if none arrived in time.
     video_age_s: Mapping[str, float | None] = field(default_factory=dict)
-    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty: they were not read
+    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty if they were not read
     clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
     app_id: int = 0  #: this application's number in this run of the proxy
     free_bytes: int | None = None  #: free space on the disk for recordings [bytes]; None: not requested

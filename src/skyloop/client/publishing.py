@@ -127,8 +127,8 @@ def _finite(name: str, value: object) -> float:
 class Membership:
     """One worker of a processor; created by :func:`skyloop.extend.join_processor`.
 
-    Ends with :meth:`close`, and with the drone. The proxy forgets a worker when its connection ends; the worker rejoins
-    automatically after a reconnection.
+    It ends on :meth:`close` and when the drone is closed. The proxy forgets a worker when its connection ends; the
+    worker rejoins automatically after a reconnection.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Membership:
         self.ready: Callable[[], bool] = lambda: True
         #: This worker's newest share of the frames; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None
-        #: Called on the receiving thread when the share has changed.
+        #: Called on the receiving thread when this worker's part has changed.
         self.changed: Callable[[ProcessorShare], None] | None = None
         self.refused: SkyloopError | None = None  #: why it is no longer a worker
         self._connection = connection
@@ -208,7 +208,7 @@ class Membership:
     def close(self) -> None:
         """Leave the group of workers. Idempotent.
 
-        The proxy gives its share to the other workers once renewals stop, or at once when the drone is closed.
+        The proxy gives its frames to the other workers once renewals stop, or at once when the drone is closed.
         """
         self._leave()
         self._ended = True

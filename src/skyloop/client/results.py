@@ -89,7 +89,7 @@ class Result:
     def value(self) -> Any:
         """The return value of ``process``, with dataclasses as dicts, tuples as lists, and read-only arrays.
 
-        Raises :class:`DecodeError` if the payload is malformed, which only a foreign program can send.
+        Raises :class:`DecodeError` if the payload is malformed, which only happens if another program sent it.
         """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
@@ -128,7 +128,7 @@ class ResultMailbox:
         self._mailboxes: dict[str, Mailbox[Result]] = {}
 
     def put(self, result: Result) -> None:
-        """Add a result. Call only on the receiving thread. Overtaken results are ignored."""
+        """Add a result. Call only on the receiving thread. Results that arrive after newer ones are ignored."""
         if result.overtaken:
             return  # it is counted by its channel
         mailbox = self._mailboxes.get(result.processor)
@@ -151,7 +151,7 @@ class ResultMailbox:
         return None
 
     def wait(self, timeout_s: float) -> Result | None:
-        """Take a result, waiting for one; None after ``timeout_s``, or once closed."""
+        """Wait for a result and take it; return None after ``timeout_s`` or once closed."""
         deadline = time.monotonic() + timeout_s
         while self.notifier.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
             result = None if self.closed else self.take()
@@ -225,7 +225,7 @@ class ResultChannel(Channel[Result]):
         self._captured.clear()
 
     def stats(self, now_ns: int) -> ChannelStats:
-        """Return the statistics at ``now_ns``; overtaken results count as dropped."""
+        """Return the statistics at ``now_ns``; results that arrived after newer ones count as dropped."""
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:

@@ -33,7 +33,7 @@ from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
 RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
 
-#: A callback for the answer to a request, or the error; called once.
+#: A callback that is called once, with the answer to a request or with the error.
 Done = Callable[[AnyReply | LinkError], None]
 
 
@@ -149,7 +149,7 @@ class ProxySession:
         self._pinged_ns = 0
         self._pinged = False  # a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # the topics that each of the transport's topics serves
+        self._video_users: dict[str, set[str]] = {}  # the requested topics that each of the transport's topics serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
         self._feedback = PLAIN  # the variant of feedback that arrives in this session
@@ -247,7 +247,7 @@ class ProxySession:
         """Subscribe to feedback again if none is arriving although the proxy answers.
 
         If only part of the feedback was requested, plain feedback replaces it for the rest of this session, because the
-            proxy may be older or have no room for more variants. Consumers select their samples in any case.
+            proxy may be older or have no room for more variants. Consumers filter their samples anyway.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns

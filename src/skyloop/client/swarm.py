@@ -106,7 +106,7 @@ def swarm(
 
 
 def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return the targets by name, in the order given. Pure. For targets and errors see :func:`swarm`.
+    """Return the targets by name, in the order given. Pure. See :func:`swarm` for targets and errors.
 
     ``running`` returns the names of the running proxies; it is only called if a target is a pattern.
     """
@@ -328,7 +328,7 @@ class Swarm:
         """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
 
         Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
-            paths. Drones that are set aside are left out.
+            paths. Drones that are set aside are skipped.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -538,18 +538,18 @@ class Swarm:
         return {name: feedback for name, feedback in met.items() if name not in errors}
 
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
-        """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
+        """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. If an iteration takes longer than a period, the schedule restarts from its end. When the
-        loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or attitudes
-        that it sent hover at once, because no newer ones would follow.
+        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts from its end.
+        When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or
+        attitudes that it sent hover at once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
             seconds: Duration [s]; None: until the loop ends.
 
         Raises:
-            UsageError: If ``rate_hz`` is out of range, at the first iteration.
+            UsageError: If ``rate_hz`` is out of range; raised by the first iteration.
         """
         if not 0.1 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 0.1 to 200 ticks a second")

@@ -118,12 +118,12 @@ class Mailboxes:
 class FeedbackDemand:
     """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
-    A pilot gets every sample, complete, because they show its link, its authority and failsafes. So does an observer
-    until a consumer limits its request, and whenever a consumer needs them all. A connection has one at a time.
+    A pilot gets every sample in full, because samples show its link, its authority and failsafes. So does an observer
+    until a consumer limits its request, or whenever a consumer needs them all. A connection uses one variant at a time.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription stays like this."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes after that."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request

@@ -147,7 +147,7 @@ class ServedLink(Protocol):
         """Return a descriptor that becomes readable when :meth:`serve` must be called."""
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work without waiting. Errors raised are already reported; the host retries after a pause.
+        """Do all pending work without waiting. Errors raised have already been reported; the host retries later.
 
         Args:
             readable: Whether :meth:`fileno` is readable; if not, the deadline returned last has passed.
@@ -232,7 +232,7 @@ class Driver(ABC):
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return those of the vehicle's own parameters that are known so far, with their current values.
+        """Return the vehicle's own parameters, as far as they are known yet, with their current values.
 
         Names are dotted and lower-case. May be called before the vehicle has answered.
         """
@@ -282,7 +282,7 @@ class Driver(ABC):
     def close(self) -> None:
         """Stop threads and release resources. Idempotent.
 
-        Does not land the vehicle, because the proxy has done so before. The sink is not called after this returns.
+        Does not land the vehicle, because the proxy has already done so. The sink is not called after this returns.
         """
         with self.__lock:
             was_open, self._sink = self._sink is not None, None

@@ -23,7 +23,7 @@ _READ_BYTES: Final = 65_536  # maximum number of bytes per read
 _BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including the start and stop bits
 _DRAIN_S: Final = 0.1  # time limit for closing a connection before a new one is opened
 END_S: Final = 0.5  #: the same for the final close, because TCP resends a lost packet after 0.2 s
-_UNACKNOWLEDGED_MS: Final = 2500  # unacknowledged data this old end a TCP connection, so they never arrive
+_UNACKNOWLEDGED_MS: Final = 2500  # age of unacknowledged data at which TCP is closed, to discard them
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line has stalled if bytes are still unsent this long after their due time
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
 #: Size of the longest frame in MAVLink and MSP [bytes]. A flight controller's parser consumes as many bytes as a frame
@@ -242,7 +242,7 @@ class TcpStream(ByteStream):
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone, when lost bytes would still be counted
+            self._socket.getpeername()  # raises if the connection is gone: lost bytes would still count
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -251,7 +251,7 @@ class TcpStream(ByteStream):
 class SerialStream(ByteStream):
     """A serial port, opened with pyserial for exclusive use and with an empty output buffer.
 
-    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` without pyserial.
+    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` if pyserial is missing.
     """
 
     def __init__(self, path: str, baud: int, what: str, extra: str, clock: Clock = monotonic_ns) -> None:

@@ -238,8 +238,8 @@ class LiveDecoder:
     def restart(self) -> None:
         """Forget the stream so far, because the next frame does not continue it."""
         self._before: Piece | None = None
-        self._failing_ns: int | None = None  # since when pieces have been undecodable
-        self._barren_since_ns: int | None = None  # since when H.264 data have yielded no frames
+        self._failing_ns: int | None = None  # when pieces began to be undecodable
+        self._barren_since_ns: int | None = None  # when H.264 data last stopped yielding frames
         self._strict: VideoCodecContext | None = None  # None while H.264 waits for a key frame
         self._shown_ns = 0  # capture time of the newest frame, before which no later frame can have been captured
         self._reorders = False  # whether the decoder holds back frames that refer to later ones

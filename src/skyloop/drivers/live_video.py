@@ -105,7 +105,7 @@ class Stream(Protocol):
 
     @property
     def lost_bytes(self) -> int:
-        """Number of bytes outside whole frames."""
+        """Number of bytes that did not belong to a complete frame."""
 
     def read(self) -> list[Coded]:
         """Return the received frames. Raises ``OSError`` if the connection is lost.
@@ -156,7 +156,7 @@ class VideoEvent(Enum):
     """Events that a receiver reports."""
 
     STREAMING = "streaming"  #: frames are arriving
-    LOST = "lost"  #: there is no connection any more, or none yet; reported once per reason, and retried forever
+    LOST = "lost"  #: the connection was lost or has not been made yet; reported once per reason, and retried forever
     UNSUPPORTED = "unsupported"  #: frames use another codec, or the data make no sense; reported once per series
     FAULT = "fault"  #: an error of this program, reported once; the video continues
 
@@ -180,7 +180,7 @@ class VideoCounters:
 
     received: int = 0
     frames: int = 0  #: frames shown
-    waited: int = 0  #: frames left out up to the next key frame, or because a newer one had been shown
+    waited: int = 0  #: frames skipped up to the next key frame, or because a newer one had been shown
     damaged: int = 0  #: frames cut off, stale at the start of a connection, or undecodable
     refused: int = 0  #: frames of an unsupported kind
     skipped: int = 0  #: frames that were wanted but superseded by newer ones before decoding
@@ -208,7 +208,7 @@ class LiveVideo:
         wants: Returns whether decoded frames are wanted. Called on the reading thread.
         wants_checked: Returns whether to decode frames even if none are wanted, because undamaged ones are forwarded.
             Called on the reading thread.
-        came: Called on the reading thread with every whole frame as it arrives.
+        came: Called on the reading thread with every complete frame as it arrives.
         clock: A monotonic clock [ns].
         name: Name of the reading thread, and prefix of the decoding thread's name.
     """
@@ -242,7 +242,7 @@ class LiveVideo:
         self._changed = threading.Condition()  # guards the backlog and the counts of the reading thread
         self._backlog = FrameBacklog()
         self._wanted = False  # whether frames were wanted when the last frame arrived
-        self._shows = False  # whether frames are wanted, and not only decoded as a check
+        self._shows = False  # whether frames are wanted, rather than only decoded as a check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0

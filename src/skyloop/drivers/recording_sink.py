@@ -316,7 +316,7 @@ def _another_number(value: float, parameter: Parameter) -> float:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Return whether two values are equal, numbers within a relative 1e-5 or an absolute 1e-6."""
+    """Return whether two values are equal; numbers may differ by a relative 1e-5 or an absolute 1e-6."""
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, (int, float)) and isinstance(other, (int, float)):

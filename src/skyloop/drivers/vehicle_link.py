@@ -24,7 +24,7 @@ from skyloop.messages import AnyAction, EventKind, Severity
 
 NAME_WAIT_S: Final = 0.2  #: time that suffices for most name look-ups
 PAUSE_S: Final = 0.03  #: pause after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets without data, because this host may have a new address
+RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets that receive nothing: this host may have a new address
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: maximum number of datagrams read before commands get their turn
 
@@ -201,14 +201,14 @@ class VehicleLink(ABC, Generic[S]):
         """Send everything due. With the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return how long after opening the sockets they are reopened; None: not in the present state.
+        """Return how long after opening the sockets they are reopened; None if they aren't at present.
 
         The default suits UDP: sockets are reopened while nothing is received. Called with the lock held.
         """
         return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
-        """Do work that has a pace of its own. Do periodic work. Called with the lock held, on the link's thread."""
+        """Do work at regular intervals. Called with the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
         """Call a function on the link's thread, without holding the lock, whenever a source is readable."""

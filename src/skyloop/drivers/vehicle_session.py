@@ -129,12 +129,12 @@ class VehicleSession(ABC):
         self.link_state: LinkState | None = None  #: the last state reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # when data last arrived; None: not since opening or a loss
+        self._received_ns: int | None = None  # when data last arrived; None: not since opening or losing the link
         self._unreachable = ""
         self._remedy = ""  # what to do if the vehicle is unreachable
         self._reported_reason = ""
         self._reported_ns = now_ns
-        self._landing_ns: int | None = None  # when a landing was last requested or, if later, the vehicle last received
+        self._landing_ns: int | None = None  # time of the last request to land or, if later, of the last data
 
     @property
     def is_receiving(self) -> bool:
@@ -187,7 +187,7 @@ class VehicleSession(ABC):
         """
 
     def _advice(self) -> str:
-        """Return an instruction for people, for use while nothing is received although nothing has failed."""
+        """Return an instruction for the user, to show while nothing is received although nothing has failed."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -238,7 +238,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` must be called next, but at most ``latest_ns``."""
+        """Return when :meth:`_check_silence` must be called next; never later than ``latest_ns``."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns

@@ -136,7 +136,7 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
     """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or hover there.
 
     ``height`` [m] is the minimum height above the start on the way; ``land`` selects landing at the end rather than
-    hovering. For None, the proxy's parameters ``return.height`` and ``return.land`` apply.
+    hovering. If these are None, the proxy's parameters ``return.height`` and ``return.land`` apply.
     """
 
     height: float | None = None
@@ -248,7 +248,7 @@ class Outcome(msgspec.Struct, frozen=True, array_like=True):
     app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
     intent: Count = 0  #: number of the intent, as in the commands for it
     fate: Fate = Fate.UNDER_WAY
-    reason: Refusal | None = None  #: why the intent was refused, or a repeat of it
+    reason: Refusal | None = None  #: why the intent, or a repeat of it, was refused
     text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the reason in readable form
 
     @property

@@ -48,7 +48,7 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: whether to queue for an authority held by another application; False: be refused
+    queue: bool = True  #: whether to queue for an authority held by another application, or else be refused
     for_s: Term | None = None  #: how long the application needs it after the grant [s]; nil: until it gives it back
     takeover: Takeover = Takeover.NOW
 
@@ -90,7 +90,7 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
     """Join the workers of a processor, or remain one: workers repeat this several times a second while they run.
 
-    The answer is :class:`Done`; which of the frames the worker gets is announced by a :class:`ProcessorShare`.
+    The answer is :class:`Done`; a :class:`ProcessorShare` announces which of the frames the worker gets.
     """
 
     processor: ProcessorName
@@ -164,7 +164,7 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A parameter, as read or after a write."""
+    """A parameter's value, as read or as it is after a write."""
 
     parameter: Parameter
 

@@ -76,12 +76,12 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     failsafe: Failsafe = Failsafe.NONE
     link_reason: LinkText = ""  #: why the vehicle link is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
-    others: LinkText | None = None  #: who else is flying the vehicle, because of which the proxy leaves it alone
+    others: LinkText | None = None  #: who else is flying the vehicle, which is why the proxy leaves it alone
     start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
-    skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
+    skipped: Count = 0  #: number of samples before this one that the proxy skipped for a subscriber with a lower rate
     outcome: Outcome | None = None  #: result of the newest intent; None: the proxy does not report it
-    next_owner: str | None = None  #: name of the first in the queue for the authority; None: the queue is empty
+    next_owner: str | None = None  #: name of the first application in the queue for the authority; None if it is empty
 
     @property
     def waking_up(self) -> bool:
@@ -223,7 +223,7 @@ class OverviewPages:
     def add(self, page: Overview) -> Overview | None:
         """Add a page; return the whole overview if this was its last missing page, otherwise None.
 
-        An overview with a missing page is dropped: the next one follows within a second.
+        An overview with a missing page is dropped, because the next one follows within a second.
         """
         if page.first == 0:
             self._seq, self._rows = page.seq, []

@@ -15,7 +15,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-#: A counter: a sequence number, a lease, an application's number. Python's ints are unbounded, others' have 64 bits.
+#: A counter: a sequence number, a lease, an application's number. Python's ints are unbounded, others have 64 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 #: The latest time, after 73 years. No monotonic clock reaches it, and the sum of a time, an offset between two clocks
@@ -178,5 +178,5 @@ class Refusal(StrEnum):
     READ_ONLY = "read_only"
     DRIVER_FAILED = "driver_failed"
     BUSY = "busy"  #: an application with at least the same priority holds the authority
-    NAME_TAKEN = "name_taken"  #: the name is in use by other code, or for another way of sharing
+    NAME_TAKEN = "name_taken"  #: the name is in use by other code, or with a different setting of ``shared``
     PROTOCOL = "protocol"  #: a request out of order, or of another protocol version

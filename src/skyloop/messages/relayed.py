@@ -93,7 +93,7 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 # Results: a processor's output for one frame, and how a processor's workers share the frames.
 
-MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
+MAX_PAYLOAD: Final = 32_768  #: maximum size of a packed result [bytes]
 MAX_CODE: Final = 128  #: characters that identify a processor's code
 MAX_PARTS: Final = 1024  #: maximum number of parts into which a camera's frames are divided, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
@@ -135,7 +135,7 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 
 ARRAY: Final = 1  #: the extension type of arrays
 MAX_DIMENSIONS: Final = 8
-MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that walking a value needs a bounded stack
+MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that a bounded stack suffices to traverse a value
 #: Allowed element types of arrays: those that are the same on every machine.
 DTYPES: Final = (
     "bool",

@@ -26,7 +26,7 @@ DEFAULT_QUALITY: Final = 80
 MIN_KBIT_S: Final = 30  #: lowest rate of a stream that the proxy encodes
 MAX_KBIT_S: Final = 50_000
 MAX_SUBSCRIBER: Final = 32  #: characters in a subscriber's name
-MIN_FPS: Final = 0.001  #: lowest rate, one frame in a quarter of an hour, so that the period stays finite
+MIN_FPS: Final = 0.001  #: lowest rate, one frame every quarter of an hour, which keeps the period finite
 _ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
 _STREAM_PREFIX: Final = "stream/"
@@ -228,7 +228,7 @@ class RateLimiter:
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Start with the first sample to arrive, which is kept. None: keep all samples."""
+        """Create a limiter, which keeps the first sample to arrive. None: keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
