@@ -596,7 +596,7 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: image widths to measure: the cameras' own size, and twice that
+SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 for the cameras' own size, and 2
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
 FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; between images, the drones fly for one period

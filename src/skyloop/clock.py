@@ -18,8 +18,8 @@ from typing import Final
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
-#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of 5
-#: ms, each packet in a flood could delay a command by that much.
+#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of
+#: 5 ms, each packet in a flood could delay a command by that much.
 SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns

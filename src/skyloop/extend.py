@@ -122,6 +122,7 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
         dial: Connects to the proxy, first now and again after each loss.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time limit for the proxy to answer and to send feedback [s].
+        **options: See :class:`skyloop.client.drone.DroneOptions`.
 
     Raises:
         SkyloopError: The same as for :func:`skyloop.connect`.

@@ -58,9 +58,9 @@ _TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate contro
 #: Fraction of a second's data that a stream may send at once, which limits the size of a key frame. A slow link has to
 #: carry it before the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3  # maximum factor by which a variable rate increases at once
+_GROWS: Final = 3  # maximum factor by which a variable rate may increase
 _FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
-_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames, although late subscribers request one
+_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames; it can be long because late subscribers request one
 #: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 

@@ -139,7 +139,7 @@ class AuthorityTracker:
 
     @property
     def behind_itself(self) -> bool:
-        """Whether the proxy just has not yet noticed that an earlier session of this process has ended."""
+        """Whether it is queued only until the proxy notices that an earlier session of this process has ended."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property

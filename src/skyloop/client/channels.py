@@ -119,7 +119,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Start with the result of ``find``, called again after each sample of ``changes``, ignoring errors."""
+        """Start with the result of ``find``, called again after each sample of ``changes``, then ignoring errors."""
         super().__init__()
         self.current = find()
         self._find = find

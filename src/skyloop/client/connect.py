@@ -136,8 +136,8 @@ def connect(
             up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20
-            s for an address, followed by 60 s for the vehicle.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and
+            20 s for an address, followed by 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that

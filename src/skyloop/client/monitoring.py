@@ -25,9 +25,9 @@ class Thresholds:
 
     late_s: float = 0.3  #: time without feedback after which the link counts as degraded
     silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
-    missing_share: float = 0.1  #: fraction of missing or malformed samples that degrades the link
+    missing_share: float = 0.1  #: fraction of missing or malformed samples in the last window that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: malformed packets within a window after which to reconnect
+    malformed: int = 5  #: malformed packets in a window at which the link counts as lost and is reconnected
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusa
 class Restorer:
     """Writes parameters again after a restart of the proxy, which has lost the values set by the application.
 
-    It rewrites only lasting values, never momentary parameters, and only if no other application can have written:
+    Rewrites only lasting values, never momentary parameters, and only if no other application can have written since:
     losing the link changes nothing at the proxy, and other pilots' newer values are kept. A proxy numbers its leases
     from 1, so a gap between two of ours means that another application held the authority and may have written.
     """

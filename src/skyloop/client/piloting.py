@@ -159,7 +159,7 @@ class Piloting:
     def end_flight(self, report: Callable[[str], object] = lambda _: None) -> SkyloopError | None:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
-        As soon as it starts, commands from the application's other threads raise :class:`ClosedError`; only an
+        As soon as this starts, commands from the application's other threads raise :class:`ClosedError`; only an
         emergency stop is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
         ``report`` is called with a text for each step. Returns the error, or None.
         """

@@ -247,7 +247,7 @@ class ProxySession:
         """Subscribe to feedback again if none is arriving although the proxy answers.
 
         If only part of the feedback was requested, plain feedback replaces it for the rest of this session, because the
-            proxy may be older or have no room for more variants. Consumers filter their samples anyway.
+        proxy may be older or have no room for more variants. Consumers filter their samples anyway.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns

@@ -328,7 +328,7 @@ class Swarm:
         """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
 
         Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
-            paths. Drones that are set aside are skipped.
+        paths. Drones that are set aside are skipped.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -404,7 +404,7 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone that it is for, sending them all at once.
 
-        Drones that are set aside are left out. A hover doesn't take a drone from others (see :meth:`hover`).
+        Drones that are set aside are skipped. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -453,7 +453,7 @@ class Swarm:
         """Call ``function`` with each active drone in a separate thread, and wait for all.
 
         Args:
-            function: A :class:`SkyloopError` raised by it fails the drone; any other exception is re-raised here.
+            function: A drone for which it raises :class:`SkyloopError` fails; other exceptions are re-raised.
             what: Name of the action in error messages; empty: the function's name.
 
         Returns:

@@ -327,7 +327,7 @@ class Driver(ABC):
     def left_to(self) -> str:
         """Return what others have made the vehicle do since our last command, such as ``RTL``.
 
-        Override this if the vehicle reports who controls it. The proxy calls it several times a second. A vehicle flown
+        Override this if the vehicle reports such changes. The proxy calls it several times a second. A vehicle flown
         by others is left alone until a new action takes it over. Thread-safe; returns at once.
 
         Returns:

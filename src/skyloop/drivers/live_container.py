@@ -214,7 +214,7 @@ class Units:
 class LiveDecoder:
     """Decodes one connection after another.
 
-    A damaged frame in H.264 is not shown, and neither are those that refer to it, up to the next key frame. Decoding
+    In H.264, damaged frames are not shown, and neither are those that refer to them, up to the next key frame. Decoding
     then restarts with a new decoder, because the old one may continue to show the damage. If these rules leave nothing
     to show for :data:`STRICT_S` (because the encoder is faulty or sends no key frames), FFmpeg alone decides what is
     good, up to the next undamaged key frame.

@@ -67,7 +67,7 @@ class Arrival(Enum):
     RESTARTED = auto()  #: the vehicle has restarted and counts from the beginning
 
 
-RESTART_RUN: Final = 5  #: number of consecutive packets with low, increasing numbers that prove a restart
+RESTART_RUN: Final = 5  #: number of packets with low, increasing numbers that prove a restart
 RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and last, to rule out a single burst
 
 

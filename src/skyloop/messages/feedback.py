@@ -76,7 +76,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     failsafe: Failsafe = Failsafe.NONE
     link_reason: LinkText = ""  #: why the vehicle link is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
-    others: LinkText | None = None  #: who else is flying the vehicle, which is why the proxy leaves it alone
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller is flying it
     start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
     skipped: Count = 0  #: number of samples before this one that the proxy skipped for a subscriber with a lower rate

@@ -15,7 +15,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-#: A counter: a sequence number, a lease, an application's number. Python's ints are unbounded, others have 64 bits.
+#: A counter: sequence number, lease or application number. Python's ints are unbounded, other languages use 64 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 #: The latest time, after 73 years. No monotonic clock reaches it, and the sum of a time, an offset between two clocks

@@ -1,4 +1,4 @@
-"""Video samples: frame headers and the encoded frames of streams. Also determines the size of image files.
+"""Video samples: frame headers and the encoded frames of streams; also functions for the size of image files.
 
 A stream holds frames as encoded by the vehicle or by the proxy. It runs only while it has subscribers.
 """

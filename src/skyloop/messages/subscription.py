@@ -1,4 +1,4 @@
-"""Subscribers' requests: the rate of feedback; the camera, encoding and rate of video. Pure. Pure.
+"""Subscribers' requests: the rate of feedback; the camera, encoding and rate of video. Pure.
 
 Each request has exactly one topic, so equal requests are encoded once for all their subscribers.
 """
