@@ -20,7 +20,7 @@ _SAME_SHAPE = 0.01  # tolerance when comparing aspect ratios, because the sizes 
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The result of :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
+    """A camera calibration by :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
 
     width: _Side  #: width of the images [px]
     height: _Side

@@ -181,7 +181,7 @@ def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[Stream
 
 
 class InboxOptions(TypedDict, total=False):
-    """Options for the samples that a thread waits for."""
+    """Options of :func:`inbox`: the samples that a thread waits for."""
 
     feedback: bool  #: whether feedback is wanted; the default is True
     frames: bool  #: whether frames are wanted; the default is True

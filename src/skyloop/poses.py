@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
-    """Create the pose with a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
+    """Create a pose from a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
 
     Raises :class:`UsageError` if a value is not finite, or the matrix is not a rotation.
     """

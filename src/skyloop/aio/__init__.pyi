@@ -966,7 +966,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone that it is for, sending them all at once.
+        """Make each action the newest set-point of the drone it is for, sending them all at once.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 

@@ -64,7 +64,7 @@ def check_seconds(what: str, seconds: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """This application's right to command."""
+    """The state of this application's right to command a drone."""
 
     #: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command. ``preempted``:
     #: taken over by another application; waiting in the queue to get it back.

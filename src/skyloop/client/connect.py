@@ -48,7 +48,7 @@ _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A program's access to the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
+    """Where to find drones on other hosts: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
 
     Attributes:
         address: ``"10.0.0.5:7447"`` connects to an address (or several, separated by commas; ``multicast`` among them

@@ -42,7 +42,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PreflightFinding:
-    """One line of the checklist."""
+    """One finding of the pre-flight checklist."""
 
     check: str  #: the subject: ``link``, ``battery``, ``position`` and so on
     level: Level  #: how serious the finding is

@@ -402,7 +402,7 @@ class Swarm:
         return self.send(dict.fromkeys(self.active, action))
 
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone that it is for, sending them all at once.
+        """Make each action the newest set-point of the drone it is for, sending them all at once.
 
         Drones that are set aside are skipped. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.

@@ -193,7 +193,7 @@ class ExternalPose:
 
 
 class Driver(ABC):
-    """Base class of drivers. It owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
+    """Base class for drivers. Owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
 
     No I/O happens before :meth:`open`. Times passed to the sink are from ``time.monotonic_ns`` on this host.
     ``_open(sink)`` starts threads and does not wait, ``_close()`` joins them and clears all set-points, and

@@ -142,7 +142,7 @@ class VehicleUri:
 
 
 def host_and_port(text: str) -> tuple[str, int] | None:
-    """Return a host and its port; None for anything else.
+    """Split an address into a host and a port; return None if it is anything else.
 
     Examples are ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` and ``[fe80::1%eth0]:14550``; the brackets
     around an IPv6 address are not part of the host.

@@ -83,8 +83,7 @@ _BY_PREFIX: Final = {
 def encode(sample: Sample) -> bytes:
     """Encode a sample as a packet.
 
-    Raises ``ValueError`` if the body is larger than :data:`MAX_BODY`, which only free text or native telemetry can
-    cause.
+    Raises ``ValueError`` if free text or native telemetry makes the body larger than :data:`MAX_BODY`.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:

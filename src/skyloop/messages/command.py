@@ -64,7 +64,7 @@ class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
 
 
 class Attitude(Action, frozen=True, array_like=True, tag=6):
-    """Attitude, climb rate and yaw rate.
+    """A set-point that makes the vehicle hold an attitude while it climbs and turns.
 
     ``roll`` [rad] is positive with the right side down, ``pitch`` [rad] with the nose down (REP 103: about y, left),
     ``climb`` [m/s] upwards, ``yaw_rate`` [rad/s] counter-clockwise.
@@ -81,7 +81,7 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
 
 class Velocity(Action, frozen=True, array_like=True, tag=7):
-    """Velocity in the body's levelled axes: ``forward``, ``left``, ``up`` [m/s], ``yaw_rate`` [rad/s]."""
+    """A set-point in the body's levelled axes: velocity ``forward``, ``left``, ``up`` [m/s]; ``yaw_rate`` [rad/s]."""
 
     forward: float = 0.0
     left: float = 0.0
@@ -94,7 +94,7 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
 
 class Position(Action, frozen=True, array_like=True, tag=8):
-    """A position to fly to and hold, in the world axes of ``Feedback.position``.
+    """A set-point that flies to a position and holds it, in the world axes of ``Feedback.position``.
 
     ``x`` is east, ``y`` north, ``z`` up [m]; ``yaw`` is counter-clockwise from x [rad], or None to keep the heading.
     ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None means as fast as the limits allow.
@@ -175,7 +175,7 @@ ACTION_NAMES: dict[type[Action], str] = {
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True):
-    """One packet of the command channel.
+    """One packet of the command channel, with the action that the vehicle is to execute.
 
     A packet whose ``seq`` is not higher than all earlier ones is refused, unless it stops the motors.
     """
@@ -206,7 +206,7 @@ MAX_OUTCOME_TEXT: Final = 300  #: maximum length of an outcome's text [character
 
 
 class Fate(StrEnum):
-    """Progress or end of an intent. A repeat never executes an intent that has ended."""
+    """What became of an intent: in progress, or how it ended. A repeat never executes an intent that has ended."""
 
     UNDER_WAY = "under_way"
     COMPLETED = "completed"

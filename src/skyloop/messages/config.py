@@ -24,7 +24,7 @@ LOWEST_PRIORITY = 31
 
 
 class Capabilities(msgspec.Struct, frozen=True, array_like=True):
-    """A vehicle's capabilities, known before the driver opens it."""
+    """What a vehicle can do and which cameras it has; known before the driver opens it."""
 
     vehicle: str  #: the vehicle's family, e.g. ``sim`` or ``ardrone2``
     actions: frozenset[str] = frozenset()  #: names of actions that the vehicle itself supports; empty if it can't fly

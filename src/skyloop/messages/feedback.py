@@ -160,7 +160,7 @@ def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True):
-    """One event: ``text`` is for people to read, ``kind`` and ``data`` are for programs."""
+    """Something that happened, and why: ``text`` is for people to read, ``kind`` and ``data`` are for programs."""
 
     kind: EventKind
     text: str

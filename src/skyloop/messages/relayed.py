@@ -15,8 +15,7 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: drawings by a controller or processor on a frame, for people and recorders; the newest wins. Coordinates
-# are in pixels of that frame.
+# Annotations: drawings by a controller or processor on a frame; the newest wins. Coordinates are in its pixels.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -25,7 +24,7 @@ GREEN: Colour = (64, 220, 100)
 
 
 class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """A line through points; if closed, a polygon (a box has four points)."""
+    """A line through points to draw on a frame; if closed, a polygon (a box has four points)."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=512)]
     closed: bool = False
@@ -33,14 +32,14 @@ class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Points(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """Single points."""
+    """Single points to draw on a frame."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=1024)]
     colour: Colour = GREEN
 
 
 class Text(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """A text next to a point."""
+    """A text to draw next to a point on a frame."""
 
     text: Annotated[str, msgspec.Meta(max_length=256)]
     at: Point
@@ -51,6 +50,8 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
+    """Shapes that a tracker or controller draws over a frame, for people and recorders."""
+
     source: Name  #: tracker or controller that drew it; only the newest annotation per source and camera is valid
     camera: Name
     captured_ns: TimeNs  #: capture time of the annotated frame
