@@ -80,7 +80,7 @@ class Commands(Protocol):
     # Presence of the person flying. While it is required but lacking, set-points are not repeated and new ones are
     # refused. Commands that end a flight are sent once, and emergency stops always work.
     def flown_by_person(self) -> None: ...  #: require their presence from now on
-    def present_until(self, until_ns: int) -> None: ...  #: a time on this process's clock [ns]; only ever extended
+    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never shortened
     def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
 
 

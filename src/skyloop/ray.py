@@ -99,10 +99,10 @@ def process(
             with, and takes precedence over, the environment variables with which an actor finds the proxy.
 
     Raises:
-        MissingExtraError: Ray is not installed.
-        UsageError: An argument is out of range, or the class is not a processor.
-        NoAnswerError: Ray does not find room for that many actors within 60 s.
-        LinkError: An actor fails; the message says why.
+        MissingExtraError: If Ray is not installed.
+        UsageError: If an argument is out of range, or the class is not a processor.
+        NoAnswerError: If Ray finds no room for that many actors within 60 s.
+        LinkError: If an actor fails; the message says why.
     """
     ray = _ray()
     if not isinstance(workers, int) or workers < 1:

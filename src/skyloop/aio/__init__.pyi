@@ -260,7 +260,7 @@ class Drone:
             latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
-            yaw: Yaw, counter-clockwise from x, reached on the way [rad]; None: keep the current yaw.
+            yaw: Yaw to reach on the way, counter-clockwise from x [rad]; None: keep the current yaw.
             speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
             wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].

@@ -247,7 +247,7 @@ class PrivateProxy:
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``.
+        """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``.
 
         The dialer raises :class:`NoAnswerError` if this takes too long, :class:`UsageError` if the address is invalid,
         and :class:`LinkError`, with the end of the child's standard error, if the child has ended.

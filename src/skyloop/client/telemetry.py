@@ -371,7 +371,7 @@ class SessionSamples:
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)
-        state.on_feedback.publish(sample)  # consumers first, then the statistics
+        state.on_feedback.publish(sample)  # serve the consumers before the statistics
         for channel in state.selected:
             channel.receive(sample)
         state.notifier.notify()

@@ -209,7 +209,7 @@ class Driver(ABC):
             its own thread.
 
     Raises:
-        UsageError: Raised by a subclass for an unknown option; see :func:`reject_unknown_options`.
+        UsageError: If a subclass does not know an option; see :func:`reject_unknown_options`.
     """
 
     shared = True
@@ -251,7 +251,7 @@ class Driver(ABC):
             The value in force, which the vehicle may have rounded.
 
         Raises:
-            ParameterError: The vehicle refuses the value; the message gives its reason.
+            ParameterError: If the vehicle refuses the value; the message gives its reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
@@ -266,8 +266,8 @@ class Driver(ABC):
             sink: Receives everything that the vehicle reports, until :meth:`close` returns.
 
         Raises:
-            UsageError: The driver is already open, or another error occurred that a retry can't fix.
-            MissingExtraError: A package that the driver needs is not installed.
+            UsageError: If the driver is already open, or another error occurred that a retry can't fix.
+            MissingExtraError: If a package that the driver needs is not installed.
         """
         with self.__lock:
             if self._sink is not None:
@@ -307,7 +307,7 @@ class Driver(ABC):
             The action as limited by the vehicle.
 
         Raises:
-            DriverError: The vehicle can't execute it; the message is shown to people.
+            DriverError: If the vehicle can't execute it; the message is shown to users.
         """
         return self._apply(action) if new else self._repeat(action)
 
@@ -366,8 +366,8 @@ class Driver(ABC):
             pose: Position and orientation in world axes.
 
         Raises:
-            UnsupportedError: The vehicle does not accept external poses.
-            DriverError: The pose can't be sent at present.
+            UnsupportedError: If the vehicle does not accept external poses.
+            DriverError: If the pose can't be sent at present.
         """
         raise UnsupportedError(f"{self.uri.scheme}:// does not accept external poses")
 
@@ -410,7 +410,7 @@ def checked_value(parameter: Parameter, value: Value) -> Value:
     """Check a new value for a scalar parameter; return it, converted to float if the parameter is a float.
 
     Raises:
-        ParameterError: The value is of the wrong type, out of range, or not one of the choices.
+        ParameterError: If the value is of the wrong type, out of range, or not one of the choices.
     """
     name, kind = parameter.name, parameter.type
     if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:

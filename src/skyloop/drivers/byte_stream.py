@@ -218,7 +218,7 @@ class TcpStream(ByteStream):
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return the received bytes, possibly none."""
+        """Return the bytes received so far, which may be none."""
         try:
             data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
@@ -242,7 +242,7 @@ class TcpStream(ByteStream):
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone: lost bytes would still count
+            self._socket.getpeername()  # raises if the connection is gone; lost bytes would still count as waiting
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -270,7 +270,7 @@ class SerialStream(ByteStream):
         return number
 
     def read(self) -> bytes:
-        """Return the received bytes, possibly none."""
+        """Return the bytes received so far, which may be none."""
         if not wait_readable(self, 0.0):
             return b""
         data = os.read(self.fileno(), _READ_BYTES)  # pyserial's read() uses select.select: only descriptors below 1024

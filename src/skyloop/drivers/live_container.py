@@ -71,8 +71,8 @@ class ContainerStream:
         read_s: Time limit for the next frame [s]. FFmpeg can't be interrupted, so :meth:`read` may take this long.
 
     Raises:
-        ProtocolRefusedError: The server refuses the requested protocol.
-        OSError: The source can't be opened, or has no supported video.
+        ProtocolRefusedError: If the server refuses the requested protocol.
+        OSError: If the source can't be opened, or has no supported video.
     """
 
     broken = 0  # FFmpeg does not report the frames it discards

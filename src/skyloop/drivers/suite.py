@@ -142,7 +142,7 @@ class DriverSuite:
             The open driver and its sink.
 
         Raises:
-            AssertionError: The link was not UP within :attr:`connect_timeout_s`, or the driver
+            AssertionError: If the link was not UP within :attr:`connect_timeout_s`, or the driver
                 broke the contract of :class:`skyloop.drivers.base.Sink`.
         """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
@@ -494,7 +494,7 @@ class DriverSuite:
             sink: The open driver's sink.
 
         Raises:
-            AssertionError: None arrived within :attr:`feedback_timeout_s`.
+            AssertionError: If none arrived within :attr:`feedback_timeout_s`.
         """
         received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"

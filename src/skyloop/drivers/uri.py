@@ -104,7 +104,7 @@ class VehicleUri:
             maximum: Largest allowed value.
 
         Raises:
-            UsageError: The option is not a finite number within the range.
+            UsageError: If the option is not a finite number within the range.
         """
         given = self.reveal(option)
         if given is None:

@@ -198,7 +198,7 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _send_due(self, now_ns: int) -> None:
-        """Send everything due. With the lock held, on any thread."""
+        """Send everything that is due. Called with the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
         """Return how long after opening the sockets they are reopened; None if they aren't at present.
@@ -238,7 +238,7 @@ class VehicleLink(ABC, Generic[S]):
                     handle(datagram, self._clock())
 
     def _send_datagram(self, port: socket.socket, datagram: bytes) -> None:
-        """Send a datagram; report failures to the session. With the lock held."""
+        """Send a datagram; report failures to the session. Called with the lock held."""
         try:
             port.send(datagram)
         except BlockingIOError:
@@ -358,10 +358,10 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
         """
 
     def _on_end(self, connection: C) -> None:
-        """Send everything that is due before the connection is closed for good. With the lock held."""
+        """Send everything that is due before the connection is closed for good. Called with the lock held."""
 
     def _on_broken(self, error: OSError, now_ns: int) -> None:
-        """Handle a connection that no longer accepts data. With the lock held."""
+        """Handle a connection that no longer accepts data. Called with the lock held."""
         self._broken = True
         self.session.broken(error, now_ns)
 

@@ -48,7 +48,7 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: whether to queue for an authority held by another application, or else be refused
+    queue: bool = True  #: whether to queue if another application holds the authority; if False, be refused
     for_s: Term | None = None  #: how long the application needs it after the grant [s]; nil: until it gives it back
     takeover: Takeover = Takeover.NOW
 
@@ -156,7 +156,7 @@ class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     """The request is queued. The grant arrives as an event and appears in feedback (``owner_id``, ``lease``)."""
 
-    position: Count  #: 1 is next
+    position: Count  #: position in the queue; 1 is next
     holder: str
     holder_priority: Priority
     wait_s: float | None = None  #: estimated from the times for which the others requested it [s]; nil: unknown

@@ -15,7 +15,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-#: A counter: sequence number, lease or application number. Python's ints are unbounded, other languages use 64 bits.
+#: A counter: sequence number, lease or application number. Python's ints are unbounded; other languages use 64 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 #: The latest time, after 73 years. No monotonic clock reaches it, and the sum of a time, an offset between two clocks
@@ -70,7 +70,7 @@ class LinkState(StrEnum):
     CONNECTING = "connecting"  #: first attempt in progress, nothing received yet
     UP = "up"
     DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
-    LOST = "lost"  #: nothing received past the threshold; reconnecting automatically
+    LOST = "lost"  #: nothing received for too long; reconnecting automatically
     CLOSED = "closed"  #: closed on purpose; nothing more will arrive
 
 

@@ -15,7 +15,7 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: drawings by a controller or processor on a frame; the newest wins. Coordinates are in its pixels.
+# Annotations: drawings by a controller or processor on a frame; the newest wins. Coordinates are in frame pixels.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
