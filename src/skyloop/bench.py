@@ -512,7 +512,7 @@ class _Pair:
         try:
             return pipe.recv()
         except (EOFError, ConnectionResetError):
-            raise LinkError(f"a measuring process of {self._kind} ended; its error is above") from None
+            raise LinkError(f"a measuring process of {self._kind} ended; see its error above") from None
 
     def __enter__(self) -> _Pair:
         return self

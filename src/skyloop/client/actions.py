@@ -137,7 +137,7 @@ def in_world_axes(
     latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
     if not is_on_earth(latitude_deg, longitude_deg):
         raise UsageError(
-            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
+            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within ±89.9 and ±180"
         )
     origin = None if newest is None else newest.origin
     if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:

@@ -1206,7 +1206,7 @@ class Drone:
     def __exit__(self, *_: object) -> None:
         problem = self._piloting.end_flight()
         if problem is not None:
-            _log.warning("%s could not be left as it should: %s", self.name, problem)
+            _log.warning("%s could not be left properly: %s", self.name, problem)
 
     def __repr__(self) -> str:
         return f"<Drone {self.name or '?'} ({self._connection.state.value}, authority {self.authority.state})>"

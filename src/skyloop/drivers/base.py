@@ -188,7 +188,7 @@ class ExternalPose:
         """
         ahead_ns = self.captured_ns - now_ns
         if ahead_ns > AHEAD_NS:
-            raise DriverError(f"a pose is stamped {seconds(ahead_ns):.2g} s ahead of this host's clock, at most 0.05 s")
+            raise DriverError(f"the pose is stamped {seconds(ahead_ns):.2g} s ahead of our clock, more than 0.05 s")
         return self if ahead_ns <= 0 else replace(self, captured_ns=now_ns)
 
 
