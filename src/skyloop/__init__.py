@@ -1,4 +1,4 @@
-"""Skyloop: closes the loop between a camera and a small drone with a few lines of Python.
+"""Skyloop closes the loop between a camera and a small drone with a few lines of Python.
 
 ::
 

@@ -19,7 +19,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
 #: A secret within a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``, whose end is ambiguous.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
 _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
-#: Prefixes of places that are devices, which have no user even if their path contains an ``@``.
+#: Prefixes of places that are devices and so never contain a user name, even if their path contains an ``@``.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
 _KEEP: Final = "/:@*,;=()[]~!$'+"  # usual punctuation in addresses
 
@@ -35,8 +35,8 @@ def is_loopback(host: str) -> bool:
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
     """Return a part of an address without anything that may be secret: user, password, query and keys.
 
-    ``text``, percent-decoded, is the address of a stream, the value of an ``option``, or the place in a vehicle's
-    address with the scheme ``place_of``. ``broken``: whether splitting the address may have cut a password in it.
+    ``text`` (percent-decoded) is the address of a stream, the value of ``option``, or the place in a vehicle's address,
+    whose scheme is ``place_of``. ``broken``: whether splitting the address may have cut a password in it.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
@@ -56,17 +56,17 @@ def _hide(path: str) -> str:
 
 
 def shown_name(option: str) -> str:
-    """Return an option's name as it may be shown; if it is not a valid name, it may be the end of a password."""
+    """Return an option's name if it can be shown; an invalid name may be the end of a password, so it is hidden."""
     return option if _NAME.match(option) else HIDDEN
 
 
 def is_broken(options: Iterable[str]) -> bool:
-    """Return whether the options' names show that an address was split within its password."""
+    """Return whether the names of the options show that an address was split within its password."""
     return any("@" in option for option in options)
 
 
 def shown_address(text: str) -> str:
-    """Return the user's input, ``scheme://place?option=value`` or anything else, without what may be secret."""
+    """Return what the user entered, ``scheme://place?option=value`` or anything else, without possible secrets."""
     scheme, separator, rest = text.partition("://")
     place, mark, query = rest.partition("?")
     if not separator:

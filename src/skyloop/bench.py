@@ -1,4 +1,4 @@
-"""Measure the user's machine: delays, compared to a bare hand-over of the same bytes, and the simulator's speed.
+"""Measure the user's machine: delays, compared to a bare transfer of the same bytes, and the simulator's speed.
 
 ``skyloop bench`` prints the results. The developers' measurements are in the repository's ``benchmarks/``.
 """
@@ -67,7 +67,7 @@ Progress = Callable[[float, str], None]
 COMMAND: Final = "command"
 FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
-#: The channels, and their periods [s] in the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
+#: The channels, with their periods [s] in the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
 LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
 
@@ -159,23 +159,23 @@ def spread(times_ns: Sequence[float]) -> Spread:
 CAMERA: Final = "bench"
 USUAL_CAMERA: Final = CameraInfo(CAMERA, 320, 240, 15.0)
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
-_UNIT_M_S: Final = 2.0**-46  # per nanosecond: 2**40 ns stay below 2 cm/s
+_UNIT_M_S: Final = 2.0**-46  # climb rate per nanosecond; 2**40 ns stay below 2 cm/s
 
 
 def stamped(sent_ns: int) -> float:
-    """Encode a time as a climb rate below 2 cm/s, which stays exact in a command and within all limits."""
+    """Encode a time as a climb rate below 2 cm/s, which a command represents exactly and which is within all limits."""
     return (sent_ns % _WRAPS_NS) * _UNIT_M_S
 
 
 def stamp_of(up: float, now_ns: int) -> int:
-    """Decode the time within the last 18 minutes [ns] that :func:`stamped` encoded as a climb rate [m/s]."""
+    """Decode a time [ns] that :func:`stamped` encoded as a climb rate [m/s] within the last 18 minutes."""
     return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
     """A vehicle that hovers forever and produces feedback and frames on request, to measure only Skyloop.
 
-    ``received`` is called on the applying thread with each new set-point.
+    ``received`` is called with each new set-point, on the thread that applies it.
     """
 
     shared = False
@@ -194,11 +194,11 @@ class BenchVehicle(Driver):
         self.publish_feedback(time.monotonic_ns())
 
     def _close(self) -> None:
-        """Do nothing: no resources are held."""
+        """Do nothing, because no resources are held."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
-        if type(action) is Velocity and action.up != self._last_up:  # differs in each call; equal ones are repeats
+        if type(action) is Velocity and action.up != self._last_up:  # an equal value is a repeat
             self._last_up = action.up
             self._received(COMMAND, stamp_of(action.up, now_ns))
         return action
@@ -250,7 +250,7 @@ class Vehicle:
 
 
 class Listening:
-    """Reports each feedback and frame once, on the connection's receiving thread."""
+    """Reports each feedback sample and each frame once, on the connection's receiving thread."""
 
     def __init__(self, received: Received) -> None:
         self._received = received
@@ -267,7 +267,7 @@ class Listening:
         self._received(VIDEO, frame.captured_ns)
 
     def picture(self, picture: EncodedFrame) -> None:
-        """Report an encoded image."""
+        """Report an encoded frame."""
         self._received(VIDEO, picture.captured_ns)
 
 
@@ -297,19 +297,19 @@ class Application:
         self._drone.close()
 
 
-# The bare hand-over -------------------------------------------------------------------------------------------------
+# The bare connection ------------------------------------------------------------------------------------------------
 
-_STAMP: Final = struct.Struct("<qqq")  # time of sending, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with zero size, and three numbers: 100 bytes, as in Skyloop
+_STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
+_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with a size of zero, and three numbers: 100 bytes, as in Skyloop
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
 class BareVehicle:
-    """The hand-over without Skyloop: the minimum that any Python library must do to transfer the same bytes.
+    """A connection without Skyloop: the minimum that any Python library must do to transfer the same bytes.
 
-    One ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet is 100 bytes with the sending time. A
-    frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver creates an
-    array over the memory. Arguments and methods are those of :class:`Vehicle`.
+    One ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet has 100 bytes, which include the sending
+    time. A frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver
+    creates an array over the memory. Arguments and methods are those of :class:`Vehicle`.
     """
 
     def __init__(self, folder: str, received: Received) -> None:
@@ -317,7 +317,7 @@ class BareVehicle:
         self._descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
-        self._memory[:] = 1  # map the pages before the first frame, as in Skyloop's slots after their first use
+        self._memory[:] = 1  # map the pages in advance: Skyloop's slots stay mapped after their first use
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
@@ -392,20 +392,20 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
     BARE: (BareVehicle, BareApplication),
     SKYLOOP: (Vehicle, Application),
 }
-_TURN_S: Final = 5.0  # duration of a turn of one kind of hand-over
-_WARM_UP_S: Final = 0.4  # uncounted start of a turn, in which threads, slots and the connection are set up
-_SETTLE_S: Final = 0.3  # time for the last samples of a turn to arrive
-_AHEAD_NS: Final = 50_000_000  # how far ahead the start time is set, so that both processes can start together
-_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the turn
+_TURN_S: Final = 5.0  # duration of one measurement of one kind of connection
+_WARM_UP_S: Final = 0.4  # uncounted start of a measurement, which sets up threads, slots and the connection
+_SETTLE_S: Final = 0.3  # time for the last samples of a measurement to arrive
+_AHEAD_NS: Final = 50_000_000  # how far in the future the start time is set, so that both processes can start together
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the measurement
 _GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
-#: Sending and receiving time of each sample [ns], by channel.
+#: Times at which each sample was sent and received [ns], by channel.
 _Arrivals = dict[str, list[tuple[int, int]]]
 
 
 class _Turn(msgspec.Struct, frozen=True):
-    """A turn with all three channels at once; ``number`` varies their relative phases."""
+    """A measurement with all three channels active at once; ``number`` varies the phases between them."""
 
     number: int
     seconds: float
@@ -430,7 +430,7 @@ class DelayRow(msgspec.Struct, frozen=True):
     channel: str
     skyloop: Spread
     bare: Spread
-    lost: int  #: number of samples that Skyloop's receiver never got
+    lost: int  #: number of samples that never reached Skyloop's receiver
 
 
 class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
@@ -444,7 +444,7 @@ class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
 def measure_delays(
     seconds: float, sizes: Sequence[tuple[int, int]], progress: Progress = lambda _share, _what: None
 ) -> DelayResults:
-    """Measure Skyloop and the bare hand-over alternately, each between two processes.
+    """Measure Skyloop and a bare connection in turn, each between two processes.
 
     Each measurement takes ``seconds`` for each frame size (width and height, at most :data:`LARGEST`). Raises
     :class:`LinkError` if the processes do not find each other, or nothing arrives.
@@ -477,7 +477,7 @@ def named(size: tuple[int, int]) -> str:
 
 
 class _Pair:
-    """The two processes of one kind of hand-over."""
+    """The two processes of one kind of connection."""
 
     def __init__(self, kind: str, folder: str) -> None:
         self._kind = kind
@@ -492,8 +492,8 @@ class _Pair:
             self._pipes.append(ours)
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
-        """Return the delays of the samples received in a turn [ns], by channel."""
-        for pipe in self._pipes:  # the vehicle starts before the application
+        """Return the delays of the samples received in a measurement [ns], by channel."""
+        for pipe in self._pipes:  # the vehicle must start before the application
             pipe.send(turn)
             self._answer(pipe)
         begin_ns = time.monotonic_ns() + round(_WARM_UP_S * 1e9) + _AHEAD_NS
@@ -512,20 +512,20 @@ class _Pair:
         try:
             return pipe.recv()
         except (EOFError, ConnectionResetError):
-            raise LinkError(f"a measuring process of {self._kind} ended; its error is above") from None
+            raise LinkError(f"a measuring process of {self._kind} ended; see its error above") from None
 
     def __enter__(self) -> _Pair:
         return self
 
     def __exit__(self, *_: object) -> None:
         for pipe in self._pipes:
-            pipe.close()  # ends the process
+            pipe.close()  # makes the process exit
         for process in self._processes:
             process.close()
 
 
 def _run_end(number: int, kind: str, side: str, folder: str) -> None:
-    """Run one end of a hand-over, turn by turn, until its pipe closes. The main function of a process."""
+    """Run one end of a measured connection until its pipe closes. The main function of a process."""
     make, work = _ENDS[kind][side == "application"], _WORK[side]
     with Connection(number) as pipe, suppress(KeyboardInterrupt, EOFError, BrokenPipeError):
         while True:
@@ -563,7 +563,7 @@ def _produce(end: Vehicle, turn: _Turn, begin_ns: int) -> None:
 
 
 def _steer(end: Application, turn: _Turn, begin_ns: int) -> None:
-    """Send set-points, no two alike."""
+    """Send a series of set-points that all differ."""
     for index in turn.paced(COMMAND, begin_ns):
         speed, angle = 0.5 + 0.4 * math.sin(0.05 * index), 0.03 * index
         end.command(time.monotonic_ns(), (speed * math.cos(angle), speed * math.sin(angle), 0.3))
@@ -577,7 +577,7 @@ _WORK: Final[dict[str, Callable[[Any, _Turn, int], None]]] = {"vehicle": _produc
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Drones in a world: their model, and whether firmware with readings from all instruments flies them."""
+    """Drones in a world: how many, which model, and whether firmware that reads all instruments flies them."""
 
     world: str
     drones: int
@@ -585,8 +585,8 @@ class Fleet:
     firmware: bool = False
 
 
-#: Free flight in an open hall; a hundred drones crowded among gates, some touching them; then drones modelled down to
-#: their rotors in steps of a millisecond, one of them with all instruments.
+#: The fleets to measure: free flight in an open hall; a hundred drones crowded among gates, some touching them; and
+#: drones modelled down to their rotors in steps of a millisecond, one of them with all instruments.
 FLEETS: Final = (
     Fleet("empty", 1),
     Fleet("empty", 10),
@@ -596,22 +596,22 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: factors for the image width: the cameras' own size, and twice that
+SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 for the cameras' own size, and 2
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
-FRAMES_PER_S: Final = 30.0  #: per camera; the drones fly for one period between images
+FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; between images, the drones fly for one period
 #: Steps per batch: a multiple of all periods, so that every batch does the same work.
 BATCH_STEPS: Final = 100
-LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if time is short
+LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if there is little time
 _TAKE_OFF_S: Final = 5.0  # simulated time before measuring begins
-#: Circles with a radius of half a metre, fast enough that rotation blurs the front camera's images.
+#: The drone flies circles with a radius of half a metre, fast enough for rotation to blur the front camera's images.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
     """Drones that fly circles, or that firmware makes fly straight up and down, without rendering.
 
-    ``step`` is the time per step, from batches of :data:`BATCH_STEPS`.
+    ``step`` is the time per step, measured over batches of :data:`BATCH_STEPS`.
     """
 
     world: str
@@ -623,7 +623,7 @@ class PhysicsRow(msgspec.Struct, frozen=True):
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Rendering with the sensor's flaws. ``round`` is the time for ``pictures`` images."""
+    """Rendering, including the sensor's flaws. ``round`` is the time for ``pictures`` images."""
 
     cameras: str
     width: int
@@ -642,7 +642,7 @@ class SimResults(msgspec.Struct, frozen=True):
 
 
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
-    """Measure physics and rendering for about ``seconds`` on the calling thread, to which OpenCV is limited.
+    """Measure physics and rendering for about ``seconds`` on the calling thread, limiting OpenCV to that thread.
 
     Building the scenes takes additional time. If Numba is installed, compiled code renders all images, including the
     first.
@@ -711,7 +711,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
 
 
 class Flight:
-    """Drones that circle in the furnished room, and their cameras, which expose in turn."""
+    """Drones that circle in the furnished room, with cameras that capture images in turn."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
         from skyloop.sim import STEP_S
@@ -724,7 +724,7 @@ class Flight:
         self._number = 0
         self.picture: Image = np.empty(0, np.uint8)  #: the last image, BGR, shape (height, width, 3)
         for at in range(len(cameras)):
-            self.draw(at)  # tables are computed for each lens's first image
+            self.draw(at)  # the first image of each lens also computes its tables
 
     def draw(self, at: int) -> int:
         """Advance the flight, then render a camera's view with its sensor's flaws; return the rendering time [ns]."""
@@ -744,10 +744,10 @@ class Flight:
 
 
 class _Hops:
-    """Firmware that makes a drone hop. It reads everything but computes nothing."""
+    """Firmware that makes a drone hop. It reads all sensors but computes nothing from them."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return full thrust near the ground and none above."""
+        """Return full thrust near the ground and no thrust above."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 
@@ -763,7 +763,7 @@ def _flown_by_firmware(fleet: Fleet) -> Simulation:
 
 
 def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
-    """Create a world whose drones have taken off and fly circles."""
+    """Create a world with drones that have taken off and fly in circles."""
     from skyloop.sim import STEP_S, Simulation, load_world
     from skyloop.sim.vehicles import VEHICLES
 

@@ -16,11 +16,11 @@ MAX_BYTES: Final = 1 << 20  #: maximum size of a file; a calibration takes less 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-_SAME_SHAPE = 0.01  # tolerance for the aspect ratio, because the sizes of small images are rounded
+_SAME_SHAPE = 0.01  # tolerance when comparing aspect ratios, because the sizes of small images are rounded
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The result of :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
+    """A camera calibration by :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
 
     width: _Side  #: width of the images [px]
     height: _Side
@@ -35,7 +35,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     rejected: _Count = 0  #: number of images rejected as outliers
     coverage: float | None = None  #: fraction of the image area in which corners were seen, 0 to 1
     fx_deviation: float | None = None  #: standard deviation of the focal length [px], estimated from the corners
-    camera: str = ""  #: name of the camera, for display
+    camera: str = ""  #: name of the camera, only for display
 
     def __post_init__(self) -> None:
         if self.model not in _LENGTHS:
@@ -58,7 +58,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return abs(width / height - self.width / self.height) <= _SAME_SHAPE * width / height
 
     def intrinsics_for(self, width: int, height: int) -> Intrinsics:
-        """Scale the intrinsics to another image size. Raises :class:`UsageError` if the aspect ratio differs."""
+        """Scale the intrinsics to a different image size. Raises :class:`UsageError` if the aspect ratio differs."""
         if not self.fits(width, height):
             raise UsageError(
                 f"the calibration is for {self.width}x{self.height} or the same aspect ratio, got {width}x{height}"

@@ -23,7 +23,7 @@ from typing import IO, Final, Protocol
 GRACE_S: Final = 4.0  #: time for a child to exit on request, and again after being terminated
 _TAIL: Final = 2000  # bytes of a child's standard error shown in an error
 _LOOK_S: Final = 0.25  # how often to check a child that may fall silent
-#: How long to read a dead child's output, because a grandchild can keep the pipe open.
+#: Time limit for reading a dead child's output, because a grandchild can keep the pipe open.
 _DRAIN_S: Final = 1.0
 #: Variable that hands data to a child: only its user can read its environment, but all users can read command lines.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
@@ -34,9 +34,9 @@ class LeftToParent(Protocol):
     """An object that belongs to the process that created it."""
 
     def forked(self) -> None:
-        """In a child made by ``os.fork``: keep all later calls away from the parent's resources.
+        """In a child created by ``os.fork``: keep all later calls away from the parent's resources.
 
-        Other threads are gone, and their locks may stay held forever, so don't acquire any.
+        The child has no other threads, and locks they held may never be released, so don't acquire any.
         """
 
 
@@ -45,7 +45,7 @@ _left_lock: Final = threading.RLock()
 
 
 def leave_to_parent(owner: LeftToParent) -> None:
-    """Have ``owner.forked()`` called in each child made by ``os.fork``, for as long as ``owner`` is in use."""
+    """Call ``owner.forked()`` in each child created by ``os.fork``, for as long as ``owner`` is in use."""
     with _left_lock:
         _left.add(owner)
 
@@ -57,7 +57,7 @@ def _leave_all() -> None:
     _left.clear()
 
 
-if hasattr(os, "register_at_fork"):  # without fork, nothing is inherited
+if hasattr(os, "register_at_fork"):  # where there is no fork, nothing is inherited
     os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
@@ -74,7 +74,7 @@ class ChildProcess:
     ) -> None:
         """Start the child.
 
-        ``keep_errors``: whether to keep its standard error for :attr:`last_words`; if False, it shares this process's.
+        ``keep_errors``: whether to keep its standard error for :attr:`last_words`; if False, it goes to this process's.
         ``inherited``: file descriptors that it inherits. ``handed``: data for :func:`handed_over` that must not be on a
         command line, which all users can read.
         """
@@ -112,22 +112,22 @@ class ChildProcess:
 
     @property
     def last_words(self) -> str:
-        """The end of the child's standard error."""
+        """Return the end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._last_words
-        number = self._errors.fileno()  # read without seeking, because the child writes at this file's position
+        number = self._errors.fileno()  # don't seek, because the child writes at this file's position
         size = os.fstat(number).st_size
         return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
 
     @property
     def ending(self) -> str:
-        """How the child ended, as text to follow its name."""
+        """How the child ended, worded to follow its name."""
         code = self.code
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
     @property
     def quoted_output(self) -> str:
-        """The end of its standard error, to append to a message; empty if it wrote nothing."""
+        """Return the end of its standard error, formatted for appending to a message; empty if it wrote nothing."""
         text = self.last_words
         return f"; its output:\n{text}" if text else ""
 
@@ -165,9 +165,9 @@ class ChildProcess:
                 self._process.wait()
 
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End the child like :meth:`end`, and close its output, which no thread may be reading. Idempotent."""
+        """End the child like :meth:`end`, then close its output, which no thread may still be reading. Idempotent."""
         if not self._ours:
-            return  # a thread that the fork left behind may have locked its output forever
+            return  # a thread that does not exist after the fork may have left its output locked
         self.end(grace_s, harder_s)
         self.stdout.close()
         self.close_errors()
@@ -183,8 +183,8 @@ class ChildProcess:
 def interrupt_deferred() -> Iterator[threading.Event]:
     """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at its end.
 
-    Used for ending several flights, where an exception midway would skip the remaining ones. Does nothing on threads
-    other than the main one, or if the program handles Ctrl-C itself.
+    Used to end several flights, where an exception midway would skip the remaining ones. Does nothing on threads other
+    than the main one, or if the program handles Ctrl-C itself.
     """
     noted = threading.Event()
     on_main = threading.current_thread() is threading.main_thread()
@@ -201,7 +201,7 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return, only once, the data that the parent handed over besides the command line; None if there is none."""
+    """Return the data passed by the parent outside the command line, on the first call only; None if there are none."""
     return os.environ.pop(_HANDED, None)
 
 
@@ -226,11 +226,11 @@ class RestartingChild:
         """Prepare; :meth:`start` starts the first child.
 
         Args:
-            command: The children's command line.
+            command: Command line of the children.
             name: Name of the threads.
             read: Reads a child's ``stdout`` to its end, on a separate thread for each child.
-            ended: Called when a child has ended, with a readable description, or with None if one could not be started.
-                Returns the pause before the next start [s]; None for no restart.
+            ended: Called with a readable description when a child has ended, or with None if a child could not be
+                started. Returns the pause before the next start [s]; None for no restart.
             started: Called with each child, under the lock, before its output is read; must be quick.
             silent: Returns whether the current child hangs and must be killed; called four times a second.
             keep_errors: See :class:`ChildProcess`.
@@ -248,17 +248,17 @@ class RestartingChild:
         self._reader: threading.Thread | None = None
         self._name = name
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
-        self.child: ChildProcess | None = None  #: the current or last one; None before the first
+        self.child: ChildProcess | None = None  #: the current child, or the last one; None before the first
         self.restarts = 0
 
     @property
     def stopping(self) -> bool:
-        """Whether no further child will be started."""
+        """Whether no more children will be started."""
         return self._stopping
 
     @property
     def over(self) -> bool:
-        """Whether the last child has ended and no further one will be started."""
+        """Whether the last child has ended and no more will be started."""
         return not self._keeper.is_alive()
 
     def start(self) -> None:
@@ -267,7 +267,7 @@ class RestartingChild:
         self._keeper.start()
 
     def request_stop(self) -> ChildProcess | None:
-        """Don't start any more children; return the current one, which keeps running. Does not wait. Idempotent."""
+        """Don't start any more children. Returns the current one, which keeps running. Does not wait. Idempotent."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -295,7 +295,7 @@ class RestartingChild:
     def _listen(self, child: ChildProcess) -> None:
         try:
             self._read(child)
-        except Exception:  # noqa: BLE001  the child is replaced all the same
+        except Exception:  # noqa: BLE001  the child is replaced anyway
             _log.exception("killing a child process whose output can't be read")
             child.kill()
         finally:
@@ -314,7 +314,7 @@ class RestartingChild:
                 self.restarts += 1
             try:
                 child = self._begin()
-            except OSError as error:  # temporarily out of memory or descriptors
+            except OSError as error:  # memory or descriptors are temporarily exhausted
                 child, ending = None, f"could not be started: {error}"
                 continue
             if child is None:
@@ -336,11 +336,11 @@ class RestartingChild:
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
-    ``descriptor`` is the pipe's reading end; standard input in a :class:`ChildProcess`.
+    ``descriptor`` is the pipe's reading end, by default standard input, as in a :class:`ChildProcess`.
     """
 
     def watch() -> None:
-        with suppress(OSError):  # unreadable: as good as closed
+        with suppress(OSError):  # if it can't be read, treat it as closed
             while os.read(descriptor, 64):
                 pass
         stop()

@@ -40,7 +40,7 @@ def slept_ns() -> int:
     """Return how long this computer has slept since it was started [ns]; 0 if unknown.
 
     The monotonic clock stops during sleep, so anything received earlier is older than its timestamp suggests. The
-    result may lag briefly, but is never too large.
+    result may be briefly out of date, but is never too large.
     """
     if _BOOTTIME is None:
         return 0
@@ -48,7 +48,7 @@ def slept_ns() -> int:
 
 
 def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
-    """Yield once per period, on absolute deadlines, until ``ended`` is set; missed periods are skipped."""
+    """Yield once per period, with absolute deadlines, until ``ended`` is set; missed periods are skipped."""
     due_s = time.monotonic()
     while True:
         due_s = max(due_s + period_s, time.monotonic())
@@ -70,13 +70,13 @@ def boot_id() -> str:
 def clock_identity() -> str:
     """Return an identifier of this process's monotonic clock; processes with the same one read the same clock.
 
-    It consists of the kernel's boot and the time namespace. It is empty if the boot is unknown.
+    It combines the kernel's boot ID and the time namespace, and is empty if the boot ID is unknown.
     """
     if not (boot := boot_id()):
         return ""
     try:
         namespace = Path("/proc/self/ns/time").stat().st_ino
-    except OSError:  # a kernel without time namespaces
+    except OSError:  # the kernel has no time namespaces
         namespace = 0
     return f"{boot}/{namespace}"
 
@@ -102,7 +102,7 @@ class ManualClock:
 class LiveClock:
     """Maps a live stream's timestamps to this host's clock, taking the smallest recent delay as zero.
 
-    Two windows, of which one is always complete, adapt to a stream whose clock runs slightly slower. Times never
+    Two time windows, of which one is always complete, allow for a stream whose clock runs slightly slower. Times never
     decrease, and are never in the future.
     """
 
@@ -114,13 +114,13 @@ class LiveClock:
         self._begun_ns = 0
 
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
-        """Return when a picture was captured, never later than it arrived.
+        """Return when a frame was captured, which is never later than it arrived.
 
-        ``stamp_s`` is its timestamp on the stream's clock [s], where a step back resets the estimate; ``arrived_ns`` is
-        on this host's monotonic clock.
+        ``stamp_s`` is its timestamp on the stream's clock [s]; if that clock jumps back, the estimate restarts.
+        ``arrived_ns`` is on this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
-        if stamp_ns < self._stamp_ns:  # the stream's clock was set back, so reset the estimate
+        if stamp_ns < self._stamp_ns:  # the stream's clock jumped back, so reset the estimate
             self._before_ns = self._smallest_ns = None
         self._stamp_ns = stamp_ns
         offset_ns = arrived_ns - stamp_ns

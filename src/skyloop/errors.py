@@ -19,7 +19,7 @@
     ├── SwarmError                        some drones of a swarm failed; carries ``errors`` by name
     └── DriverError                       the vehicle's driver failed; carries what the vehicle reported
 
-The leaves name the cause and the phase; catch the branch that you can handle.
+The leaves name the cause and the phase; catch the branch that covers all errors you can handle.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _IN_PYTHON: Final = {
 class SkyloopError(Exception):
     """Base class of all errors that Skyloop raises on purpose."""
 
-    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message says it all
+    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message is complete
 
     def with_hint(self, hint: Hint) -> Self:
         """Add a hint and return this error."""
@@ -113,7 +113,7 @@ class UnknownNameError(UsageError, KeyError):
         """The message without the hint."""
         return self.message
 
-    def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes arrive pickled
+    def __reduce__(self) -> tuple[object, ...]:  # errors from worker processes are pickled
         return partial(type(self), where=self.where), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
@@ -140,7 +140,7 @@ def install_command(*extras: str) -> str:
 class MissingExtraError(SkyloopError, ImportError):
     """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``.
 
-    ``what`` is the feature that needs it, ``cause`` why the import failed, if known.
+    ``what`` is the feature that needs it, and ``cause`` is why the import failed, if known.
     """
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:

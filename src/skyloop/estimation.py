@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 
 
 def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
-    """Return the transition and process noise over ``dt_s`` of positions, then velocities, each (2·axes, 2·axes).
+    """Return the transition and process noise over ``dt_s`` for positions, then velocities, each (2·axes, 2·axes).
 
-    Continuous white-noise acceleration (section 6.2.2): two predictions equal one over the total time, and within a
-    second the velocity wanders by the root of the ``intensity``.
+    The model is continuous white-noise acceleration (section 6.2.2): two predictions equal one over the total time, and
+    within a second the velocity varies by the square root of ``intensity``.
     """
     move = np.eye(2 * axes) + np.eye(2 * axes, k=axes) * dt_s
     wander = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]]) * intensity
@@ -32,9 +32,9 @@ def corrected(
 ) -> tuple[Array, Array]:
     """Return the state and covariance after a measurement, using Joseph's form (section 5.2.6).
 
-    With it, the covariance stays positive in spite of rounding. ``off`` is measured minus expected, (m,) or (m, k),
-    ``seen`` the derivative of the measurement with respect to the state, (m, n), and ``noise`` the covariance of the
-    measurement, (m, m). ``spread`` is the covariance of ``off``, if it differs from that of state and noise.
+    This form keeps the covariance positive in spite of rounding. ``off`` is measured minus expected, (m,) or (m, k);
+    ``seen`` the derivative of the measurement with respect to the state, (m, n); ``noise`` the measurement's
+    covariance, (m, m); and ``spread`` the covariance of ``off``, if it doesn't follow from state and ``noise``.
     """
     if spread is None:
         spread = seen @ covariance @ seen.T + noise
@@ -46,7 +46,7 @@ def corrected(
 def assignment(what: str, extra: str) -> Callable[[Array], tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Return SciPy's ``linear_sum_assignment``, which finds the pairs (rows, columns) with the least total cost.
 
-    Raises :class:`MissingExtraError`, which names the feature and the extra, without SciPy.
+    Raises :class:`MissingExtraError`, naming the feature and the extra, if SciPy is not installed.
     """
     try:
         from scipy.optimize import linear_sum_assignment

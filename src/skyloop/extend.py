@@ -29,17 +29,17 @@ class Known:
     def __init__(self, drone: Drone) -> None:
         self._drone, state = drone, drone._state
         self.app: Final = state.app  #: name of this application, as in events
-        self.reach: Final = drone._reach  #: name or address at which others can reach the vehicle; None: they can't
+        self.reach: Final = drone._reach  #: name or address at which others can reach the vehicle; None if they can't
         self.subscriber: Final = state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback, however old; None before the first."""
+        """The newest feedback, regardless of its age; None before any has arrived."""
         return self._drone._state.newest
 
     @property
     def is_ending(self) -> bool:
-        """Whether the flight is being ended or the drone is closed, so that commands raise :class:`ClosedError`."""
+        """Whether the flight is ending or the drone is closed, so that commands raise :class:`ClosedError`."""
         return self._drone._piloting.ending
 
     @property
@@ -73,14 +73,14 @@ class Commands(Protocol):
     def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
 
     def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
-    def release(self, *, wait: bool = True) -> None: ...  #: release the authority; NoAnswerError if the proxy is silent
+    def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; may raise NoAnswerError
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # Presence of the person flying. While they must be present but are not, set-points are not repeated and new ones
-    # are refused. Commands that end a flight are sent once, and emergency stops work as always.
+    # Presence of the person flying. While it is required but lacking, set-points are not repeated and new ones are
+    # refused. Commands that end a flight are sent once, and emergency stops always work.
     def flown_by_person(self) -> None: ...  #: require their presence from now on
-    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never shortens it
+    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never shortened
     def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
 
 
@@ -90,19 +90,19 @@ def commands(drone: Drone) -> Commands:
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
-    """Send ``action``, with checked numbers, like :meth:`skyloop.Drone.command`; return the intent's number."""
+    """Send ``action``, whose numbers are valid, like :meth:`skyloop.Drone.command`; return the intent's number."""
     return drone._commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
     """Hover or land because the library, not a person, has decided to. Never raises.
 
-    Leaves the vehicle alone if others fly it, if it is landing or returning, or if the application itself has landed or
+    Does nothing if others fly the vehicle, if it is landing or returning, or if the application itself landed or
     stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.
 
     Args:
         drone: The drone.
-        reason: The reason, for the log.
+        reason: Why the library lets go, for the log.
         land: Whether to land rather than hover.
         for_good: Whether the application's later commands, except for an emergency stop, raise :class:`ClosedError`.
 
@@ -121,7 +121,7 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
         kind: ``Drone``, or a class derived from it.
         dial: Connects to the proxy, first now and again after each loss.
         app: Name of this application, 1 to 64 characters.
-        timeout_s: Time for the proxy to answer and to send feedback [s].
+        timeout_s: Time limit for the proxy to answer and to send feedback [s].
         **options: See :class:`skyloop.client.drone.DroneOptions`.
 
     Raises:
@@ -155,7 +155,7 @@ def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | 
 def video_channel(
     drone: Drone, camera: str | None = None, *, max_fps: float | None = None, part: tuple[int, int] | None = None
 ) -> VideoChannel:
-    """Return the channel of a camera's frames; it calls its consumers on the receiving thread.
+    """Return the channel of a camera's frames, which calls its consumers on the receiving thread.
 
     Args:
         drone: The drone.
@@ -173,15 +173,15 @@ def video_channel(
 
 
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-    """Return the channel of a camera's H.264; without options, pictures are as the vehicle itself encoded them.
+    """Return the channel of a camera's H.264 frames; without options, these are as encoded by the vehicle itself.
 
-    Consumers are called on the receiving thread. Errors are those of :func:`video_channel`.
+    Consumers are called on the receiving thread. Raises the same errors as :func:`video_channel`.
     """
     return drone._state.video.stream(camera, **how)
 
 
 class InboxOptions(TypedDict, total=False):
-    """Which samples one thread waits for."""
+    """Options of :func:`inbox`: the samples that a thread waits for."""
 
     feedback: bool  #: whether feedback is wanted; the default is True
     frames: bool  #: whether frames are wanted; the default is True
@@ -194,7 +194,7 @@ class InboxOptions(TypedDict, total=False):
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
     """Return mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
 
-    They are a context manager, and fill while it is open. Errors are those of :func:`video_channel`.
+    The mailboxes are a context manager, and fill while it is open. Raises the same errors as :func:`video_channel`.
     """
     from skyloop.client.telemetry import Mailboxes
 

@@ -15,8 +15,8 @@ _Item = TypeVar("_Item")
 class Faults:
     """Faults to inject, as probabilities between 0 and 1 for each packet or frame, in each direction.
 
-    ``corrupt`` flips one random bit, in packets only. ``reorder`` holds an item back until the next has passed. Each
-    direction of each connection has its own ``random.Random``, derived from ``seed``.
+    ``corrupt`` flips one random bit, in packets only. ``reorder`` delays an item until after the next one. Each
+    direction of each connection has its own ``random.Random``, seeded from ``seed``.
     """
 
     seed: int = 0
@@ -40,7 +40,7 @@ class FaultInjector:
         self._held: list[object] = []
 
     def packets(self, packet: bytes) -> list[bytes]:
-        """Return what arrives when this packet is sent: any number of packets, in order of arrival."""
+        """Return what arrives when this packet is sent: any number of packets, in order of their arrival."""
         if packet and self._random.random() < self._faults.corrupt:
             damaged = bytearray(packet)
             damaged[self._random.randrange(len(damaged))] ^= 1 << self._random.randrange(8)
@@ -48,7 +48,7 @@ class FaultInjector:
         return self.items(packet)
 
     def items(self, item: _Item) -> list[_Item]:
-        """Do the same for items of any type, without corruption."""
+        """Do the same for items of any type, but without corruption."""
         held: list[_Item] = self._held  # type: ignore[assignment]
         chance = self._random.random
         if chance() < self._faults.drop:

@@ -17,8 +17,8 @@ from skyloop.errors import FileFormatError, UsageError
 
 T = TypeVar("T")
 
-MAX_TEXT: Final = 1 << 20  #: bytes in a hand-written list
-MAX_RESULTS: Final = 256 << 20  #: bytes in a file of measurements; an hour's worth takes a few megabytes
+MAX_TEXT: Final = 1 << 20  #: maximum size of a hand-written list [bytes]
+MAX_RESULTS: Final = 256 << 20  #: maximum size of a file of measurements [bytes]; an hour's worth takes a few megabytes
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
@@ -37,7 +37,7 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
 
 
 def decoded(content: bytes) -> str:
-    """Decode UTF-8, without the byte order mark that Windows editors write.
+    """Decode UTF-8, dropping the byte order mark that Windows editors add.
 
     Raises :class:`UnicodeDecodeError`.
     """
@@ -53,7 +53,7 @@ def read_text(path: str | Path, what: str, most: int) -> str:
 
 
 def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
-    """Read a JSON file as a type, like :func:`read_bytes`."""
+    """Read a JSON file as an instance of a type, like :func:`read_bytes`."""
     content = read_bytes(path, what, most)
     try:
         return msgspec.json.decode(decoded(content), type=kind)
@@ -80,7 +80,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; for an unknown user, the path stays as it is and won't be found."""
+    """Expand ``~`` to the home directory; a path with an unknown user is returned unchanged and won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -91,9 +91,9 @@ def expand(path: str | Path) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` after the block; on failure ``path`` stays untouched.
 
-    Devices and pipes are written to directly. Raises :class:`UsageError` for an ``OSError``.
+    Devices and pipes are written to directly. Raises :class:`UsageError` in place of ``OSError``.
     """
-    place = Path(os.path.realpath(path))  # replace the target of a link, and keep the link
+    place = Path(os.path.realpath(path))  # if it is a link, replace its target and leave the link in place
     special = place.exists() and not place.is_file()
     part = place if special else place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
     try:

@@ -1,8 +1,8 @@
 """Poses of the body, its cameras and targets, as SciPy's ``RigidTransform``. Needs the extra ``control``.
 
-``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s.
-Poses chain with ``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up
-(ROS REP 103); a camera's optical axes: x right, y down, z forward. Metres.
+``a_in_b`` is the pose of ``a`` in the axes of ``b``: it converts a point from ``a``'s axes to ``b``'s. Poses chain with
+``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up (ROS REP 103); a
+camera's optical axes: x right, y down, z forward. Metres.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
-    """Create the pose with a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
+    """Create a pose from a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
 
     Raises :class:`UsageError` if a value is not finite, or the matrix is not a rotation.
     """
@@ -46,7 +46,7 @@ def attitude(feedback: Feedback) -> Rotation:
 
 
 def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """Return the vehicle's pose; a given ``position`` (3,) [m] replaces the vehicle's own.
+    """Return the vehicle's pose; ``position`` (3,) [m], if given, replaces the vehicle's own.
 
     Raises :class:`UsageError` while attitude or position is unknown.
     """
@@ -67,7 +67,7 @@ def camera_in_body(camera: CameraInfo) -> RigidTransform:
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
     """Return a camera's pose when the vehicle is in the state ``feedback`` (``frame.feedback`` for an image).
 
-    ``position`` and errors as for :func:`body_in_world` and :func:`camera_in_body`.
+    ``position`` and errors are the same as for :func:`body_in_world` and :func:`camera_in_body`.
     """
     return body_in_world(feedback, position) * camera_in_body(camera)
 

@@ -1,4 +1,4 @@
-"""Create PyAV's decoders and encoders in one place: PyAV is optional, and imported when first needed."""
+"""Create PyAV's decoders and encoders in one place, because PyAV is optional and is imported when first needed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def new_decoder(
     """Create a decoder that returns each image at once; ``codec`` is FFmpeg's name. See :func:`require_pyav`.
 
     With ``patch``, damaged parts are filled from earlier images; otherwise a damaged image is an error. ``low_delay``
-    is False for a stream whose images depend on later ones, until whose arrival they are delayed.
+    is False for a stream whose images depend on later ones and are delayed until those arrive.
     """
     require_pyav(purpose)
     import av
@@ -39,13 +39,13 @@ def new_decoder(
     if patch:
         context.flags |= av.codec.context.Flags.output_corrupt
     else:
-        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse every end of a
+        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse the end of every
         # sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)
     if low_delay:
         context.flags |= av.codec.context.Flags.low_delay
-    context.thread_count = 1  # frame threads would delay images
+    context.thread_count = 1  # frame threading would delay images
     return context
 
 
@@ -58,9 +58,9 @@ _TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate contro
 #: Fraction of a second's data that a stream may send at once, which limits the size of a key frame. A slow link has to
 #: carry it before the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3  # maximum factor by which a variable rate increases
+_GROWS: Final = 3  # maximum factor by which a variable rate may increase
 _FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
-_KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
+_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames; it can be long because late subscribers request one
 #: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
@@ -70,8 +70,8 @@ class H264Encoder:
 
     H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame. Width
     and height [px] must be even. If the average rate [kbit/s] ``varies``, it may increase up to threefold; x264 fixes
-    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError`
-    without PyAV or x264.
+    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError` if
+    PyAV or x264 is missing.
     """
 
     def __init__(self, width: int, height: int, fps: float, kbit_s: int, *, varies: bool = False) -> None:
@@ -112,20 +112,20 @@ class H264Encoder:
         return self._most_kbit_s / _FALLS <= kbit_s <= self._most_kbit_s
 
     def set_rate(self, kbit_s: int) -> None:
-        """Change the average rate from the next image on [kbit/s], at no cost; see :meth:`carries`."""
+        """Change the average rate [kbit/s], starting with the next image, at no cost; see :meth:`carries`."""
         self.kbit_s = kbit_s
         self._context.bit_rate = kbit_s * 1000
 
     def encode(
         self, pixels: NDArray[np.uint8], form: str, captured_ns: int, *, key: bool = False
     ) -> tuple[bytes, bool]:
-        """Encode one image, letting other threads run in the meantime.
+        """Encode one image without blocking other threads.
 
         Args:
             pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous; any size is scaled.
             form: FFmpeg's name for the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
             captured_ns: Capture time [ns], later than the previous one.
-            key: Whether to make it a key frame.
+            key: Whether the image becomes a key frame.
 
         Returns the access unit, empty if the encoder returned none, and whether it is a key frame.
         """

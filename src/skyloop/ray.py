@@ -24,7 +24,7 @@ _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK"
 
 
 class Workers:
-    """The actors of one processor, created by :func:`process`. A context manager that ends them."""
+    """The actors of one processor, created by :func:`process`. As a context manager, it ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
         """Keep Ray's handles for the actors."""
@@ -37,7 +37,7 @@ class Workers:
             timeout_s: How long to wait for all actors [s].
 
         Raises:
-            LinkError: An actor can't continue, for example because other code took the name; the message says why.
+            LinkError: If an actor can't continue, for example because other code took its name; the message says why.
         """
         ray = _ray()
         asked = [actor.status.remote() for actor in self.actors]
@@ -90,19 +90,19 @@ def process(
         drone: Name or address of the drone, as reachable from each actor's host.
         workers: Number of actors, at least 1.
         camera: Name of the camera; None: the vehicle's first.
-        name: Name of the processor; None: the class's in lower case.
+        name: Name of the processor; None: the class's name in lower case.
         shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
         max_age_s: Frames older than this when their turn comes are skipped [s]; None: no limit.
         max_fps: Maximum frame rate of each worker; None: no limit.
-        stuck_s: If a call of ``process`` takes longer than this [s], the worker's share goes to the others.
+        stuck_s: If a call to ``process`` takes longer than this [s], the worker's frames go to the others.
         **options: Options of Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged
             with, and takes precedence over, the environment variables with which an actor finds the proxy.
 
     Raises:
-        MissingExtraError: Ray is not installed.
-        UsageError: An argument is out of range, or the class is not a processor.
-        NoAnswerError: Ray does not find room for that many actors within 60 s.
-        LinkError: An actor fails; the message says why.
+        MissingExtraError: If Ray is not installed.
+        UsageError: If an argument is out of range, or the class is not a processor.
+        NoAnswerError: If Ray finds no room for that many actors within 60 s.
+        LinkError: If an actor fails; the message says why.
     """
     ray = _ray()
     if not isinstance(workers, int) or workers < 1:

@@ -18,17 +18,17 @@ from skyloop.errors import FileFormatError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 1 << 18  #: bytes in a file; the largest world shipped takes 5 kB
-#: Maximum number of parts in a key. A parser visits all of them for each key below: minutes, if there are ten thousand.
+MAX_BYTES: Final = 1 << 18  #: maximum size of a file [bytes]; the largest world shipped takes 5 kB
+#: Maximum number of parts in a key. For every key, a parser visits all parts above it: with 10,000, this takes minutes.
 MAX_DEPTH: Final = 16
 MAX_WHOLE: Final = (1 << 63) - 1  #: TOML's limit; larger numbers are neither shown nor used
-#: Held during conversions: msgspec inspects a struct's fields on the first one, and crashes if two threads do so.
+#: Held during conversions: msgspec inspects a struct's fields the first time, and crashes if two threads do so at once.
 _converting = threading.Lock()
 _SHOWN: Final = 80  #: characters of a wrong value in a message
-# Possessive quantifiers, and starting only where a part starts, avoid backtracking: a miss is as fast as a match.
+# Possessive quantifiers, and matching only at the start of a part, avoid backtracking: a miss is as fast as a match.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
-_WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # the end of a msgspec error
+_WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # how a msgspec error ends
 _STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 _KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a text", list: "a list", dict: "a table"}
 
@@ -45,7 +45,7 @@ class Place:
         return Place(self.source, f"{self.table}.{key}" if self.table else key)
 
     def item(self, key: str, number: int, name: object) -> Place:
-        """Return the place of one of several tables, by its name or its number, starting with 1."""
+        """Return the place of one table in an array of tables, by its name or its number, counting from 1."""
         place = self.under(key).table
         return Place(self.source, f"{place} {name!r}" if isinstance(name, str) and name else f"{place} #{number}")
 
@@ -61,18 +61,18 @@ class Place:
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if it is not TOML."""
+    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if parsing fails."""
     if _DEEP_KEY.search(text):
         raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:
         values: dict[str, Any] = msgspec.toml.decode(text)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also for numbers and lists that are too large
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # even if it is just too large
         raise FileFormatError(f"{source}: not valid TOML: {error}") from None
     return values
 
 
 def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
-    """Convert the result of :func:`parse_toml` to a struct that forbids unknown keys.
+    """Convert the result of :func:`parse_toml` to a struct; unknown keys are errors.
 
     Its fields may be tables and lists of tables. Raises :class:`FileFormatError` if a key is missing or unknown, or a
     value has the wrong type or is out of range.
@@ -85,7 +85,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Add the given value and a hint to msgspec's error, which has only the place and the expected type."""
+    """Add the given value and a hint to msgspec's error, which contains only the place and the expected type."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():
@@ -183,7 +183,7 @@ def _wanted(info: inspect.Type, place: Place) -> str:
 
 
 def _range(low: float | None, high: float | None) -> str:
-    """Describe a number between these bounds; the largest float means no upper bound."""
+    """Describe a number between these bounds; if the upper one is the largest float, there is no upper bound."""
     least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
     if least and most:
         return f"a number from {low:g} to {high:g}"

@@ -1,4 +1,4 @@
-"""Where a vehicle may fly: the walls of a room, the safety box, and no-fly zones; all upright, in world axes. Pure.
+"""The space in which a vehicle may fly: a room's walls, a safety box and no-fly zones, upright, in world axes. Pure.
 
 World axes are x east, y north, z up [m]. The proxy decides what a vehicle does near these walls.
 """
@@ -18,7 +18,7 @@ FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is i
 MAX_ZONES: Final = 32
 #: Thinner zones are enlarged to this thickness [m], so that an overshoot or a gust can't carry a vehicle across.
 THINNEST_M: Final = 0.5
-BOX: Final = "safety.box"  #: prefix of the parameters for the box
+BOX: Final = "safety.box"  #: prefix of the box's parameters
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
@@ -30,7 +30,7 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane: the unit vector towards it in world axes, and its distance [m], which is negative beyond it."""
+    """A plane, given by the unit vector towards it in world axes and its distance [m], which is negative beyond it."""
 
     normal: Vec3
     distance: float
@@ -47,7 +47,7 @@ class Box:
     name: str = ""  #: name of the zone, if any
 
     def walls_inside(self, place: Vec3) -> Iterator[Wall]:
-        """Yield the walls of a box to stay inside of."""
+        """Yield the walls of a box that a vehicle must stay inside."""
         for axis in range(3):
             for sign, distance in ((-1.0, place[axis] - self.low[axis]), (1.0, self.high[axis] - place[axis])):
                 normal = [0.0, 0.0, 0.0]
@@ -55,7 +55,7 @@ class Box:
                 yield Wall((normal[0], normal[1], normal[2]), distance, BOX)
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """Return the wall of a box to stay outside of."""
+        """Return the wall that a vehicle outside the box must not cross."""
         nearest = tuple(max(low, min(high, at)) for low, high, at in zip(self.low, self.high, place, strict=True))
         way = (nearest[0] - place[0], nearest[1] - place[1], nearest[2] - place[2])
         distance = math.hypot(*way)
@@ -71,7 +71,7 @@ class Box:
         return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two positions crosses it."""
+        """Return whether the straight line between two positions crosses the zone."""
         first, last = 0.0, 1.0
         for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
             first, last = _within(low, high, at, to, first, last)
@@ -99,7 +99,7 @@ class Cylinder:
     name: str = ""
 
     def wall_outside(self, place: Vec3) -> Wall:
-        """Return the wall of a cylinder to stay outside of."""
+        """Return the wall that a vehicle outside the cylinder must not cross."""
         east, north = self.x - place[0], self.y - place[1]
         off = math.hypot(east, north)
         aside = (east / off, north / off) if off > 0.0 else (1.0, 0.0)
@@ -118,13 +118,13 @@ class Cylinder:
         return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
-        """Return whether the straight line between two positions crosses it."""
+        """Return whether the straight line between two positions crosses the zone."""
         first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
         if first > last:
             return False
         x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
         length = across * across + along * along
-        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # position along the infinite line
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # nearest point of the infinite line
         share = max(first, min(last, nearest))
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
@@ -144,12 +144,12 @@ Zone = Box | Cylinder
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Where a vehicle may fly."""
+    """The space in which a vehicle may fly."""
 
     room: Box | None = None  #: the room's walls, which the vehicle can't pass; None if unknown
     box: Box | None = None  #: the safety box; None if there is none
-    zones: tuple[Zone, ...] = ()  #: the no-fly zones, as written
-    #: The zones as they are enforced, made at least :data:`THINNEST_M` thick.
+    zones: tuple[Zone, ...] = ()  #: the no-fly zones, exactly as given
+    #: The zones that are enforced, enlarged to be at least :data:`THINNEST_M` thick.
     barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -157,12 +157,12 @@ class Space:
 
     @property
     def walled(self) -> bool:
-        """Whether there are walls that limit set-points, which a room's walls do not."""
+        """Whether there are walls that limit set-points; the walls of a room do not."""
         return self.box is not None or bool(self.zones)
 
     @property
     def thin(self) -> tuple[Zone, ...]:
-        """The zones that are thickened, as written."""
+        """The zones that had to be enlarged, as originally given."""
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
@@ -177,7 +177,7 @@ class Space:
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
-        """Return what blocks the straight line between two positions, as readable text; empty if nothing does.
+        """Return what blocks the straight line between two positions, as readable text; empty if nothing is in the way.
 
         A zone that contains the start is ignored, so that a vehicle can leave it.
         """
@@ -188,7 +188,7 @@ class Space:
 
 
 def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
-    """Return the space in which parameters, whose values the functions return by name, allow a vehicle to fly.
+    """Return the space in which a vehicle's parameters allow it to fly; the functions return their values by name.
 
     Raises :class:`ParameterError` if the zones can't be parsed.
     """
@@ -202,12 +202,12 @@ def _room(text: str) -> Box | None:
     try:
         zones = parse_zones(text)
     except ParameterError:
-        return None  # a driver uses this name for something else
+        return None  # a driver uses this name for a different purpose
     return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
 
 
 def parse_zones(text: str) -> tuple[Zone, ...]:
-    """Parse zones, separated by semicolons. Raises :class:`ParameterError` if that fails, or there are too many.
+    """Parse zones separated by semicolons. Raises :class:`ParameterError` if that fails or there are too many.
 
     A zone is ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. It may be
     preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.
@@ -247,7 +247,7 @@ def _parse_zone(text: str) -> Zone:
 def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
     """Check a new value for a safety parameter against the others.
 
-    Raises :class:`ParameterError` if a wall of the box is beyond the opposite one, or the zones can't be parsed.
+    Raises :class:`ParameterError` if the box's opposite walls are the wrong way round or the zones can't be parsed.
     """
     if name == ZONES:
         parse_zones(str(value))
@@ -279,7 +279,7 @@ def _wrong(why: str) -> ParameterError:
 
 
 def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
-    """Return the part of the segment from ``at`` to ``to`` between two walls, within ``first`` to ``last``."""
+    """Return the part of the segment from ``at`` to ``to`` that is between two walls, within ``first`` to ``last``."""
     if at == to:
         return (first, last) if low <= at <= high else (1.0, 0.0)
     one, other = (low - at) / (to - at), (high - at) / (to - at)

@@ -92,7 +92,7 @@ class Drone:
     Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
     Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
     callbacks are the exception: they are plain functions in their own threads, because image processing would block the
-    event loop. So is the predicate of :meth:`wait`.
+    event loop. The predicate of :meth:`wait` is a plain function, too.
     """
 
     sync: client.Drone
@@ -112,16 +112,16 @@ class Drone:
 
         A JPEG is decoded on another thread, while :meth:`frame` decodes on the event loop.
 
-        Errors are raised by the first iteration, not by the call.
+        The first iteration raises the errors, not the call itself.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, so that n workers, with k from 0, can share the frames.
+                ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
                 ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
                 ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
-                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                with smaller and fewer frames if that is low) or ``"raw"``; within one host, all frames are raw.
                 ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
@@ -163,17 +163,17 @@ class Drone:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay across all pilots, requested from the proxy with a wait of up to 0.2 s.
+        callback. Otherwise it is the delay for all pilots, which takes up to 0.2 s to request from the proxy.
         """
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
         """Run the pre-flight checklist; each finding comes with a reason and a remedy.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Reads the proxy's parameters and requests a picture from each camera. Doesn't fly and needs no authority.
+        Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
 
         Args:
-            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            video_s: Total time to wait for frames [s]; 0: don't check cameras.
             folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
@@ -200,7 +200,7 @@ class Drone:
                 the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
                 reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
@@ -221,10 +221,10 @@ class Drone:
             NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
+            LinkError: If the link is down and ``wait`` is False; the landing is still sent within 0.5 s if possible.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
+            UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
         """
     async def go_to(
         self,
@@ -249,7 +249,7 @@ class Drone:
         World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
         ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application goes silent: the vehicle stops there. It is held until the next
+        position does not decay when the application stops sending: the vehicle stops there. It is held until the next
         command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
         obstacles.
 
@@ -260,7 +260,7 @@ class Drone:
             latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
-            yaw: Yaw, counter-clockwise from x, reached on the way [rad]; None: keep the current yaw.
+            yaw: Yaw to reach on the way, counter-clockwise from x [rad]; None: keep the current yaw.
             speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
             wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
@@ -268,12 +268,12 @@ class Drone:
             tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
 
         Raises:
-            NoAnswerError: If it does not arrive in time; the message gives its state and, if known, the reason.
+            NoAnswerError: If it has not arrived in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
                 ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
@@ -288,21 +288,21 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends the flight. Obstacles are not
         avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
-            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
-            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
+            land: Whether to land there instead of hovering above it; None: the parameter ``return.land``.
+            wait: Whether to wait until it has landed, or hovers above its start, rather than only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it is not over in time; the message gives the vehicle's state and, if known, the reason.
+            NoAnswerError: If it has not ended in time; the message gives the vehicle's state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
@@ -322,18 +322,18 @@ class Drone:
 
         A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
         it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
-        may decline. Once granted, the authority is kept: after a lost link it is requested again, and after a
-        pre-emption it returns when the other application releases it.
+        may decline. Once granted, the authority is kept: after the link is lost it is requested again, and after a
+        pre-emption it is regained when the other application releases it.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: How long to wait in the queue [s].
+            priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
+            wait_s: Maximum time to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
-            stay: Stay in the queue after ``wait_s`` instead of raising.
+            stay: Whether to stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
+            The status: held or, if ``stay`` is True, possibly queued, including the position and the expected wait.
 
         Raises:
             AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
@@ -343,7 +343,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
     async def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
+        """Release the authority or leave the queue, and wait until the proxy confirms it.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -354,13 +354,13 @@ class Drone:
             ClosedError: If the drone was closed.
         """
     async def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for unread feedback, and return the newest.
+        """Wait for feedback that has not been read yet, and return the newest.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples requested by other consumers are returned, too.
+            max_hz: As for :meth:`feedback`; samples requested by other consumers may be returned, too.
 
         Raises:
             NoAnswerError: If none arrives in time.
@@ -368,7 +368,7 @@ class Drone:
             UsageError: If called from an inline callback, or an option is out of range.
         """
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
-        """Wait for a frame that this method has not returned yet, and return the newest.
+        """Wait for a frame that this method has not returned yet, then return the newest one.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -408,11 +408,11 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Overviews are sent once a second and are much smaller than feedback, which helps applications that watch many
+        Overviews are sent once a second and are much smaller than feedback, so they suit applications that watch many
         vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
-            timeout_s: How long to wait for the first one [s].
+            timeout_s: How long to wait for the first overview [s].
 
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
@@ -451,7 +451,7 @@ class Drone:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and so of ages and delays; 0 if both use the same clock."""
     @property
     def start_position(self) -> Vector | None:
         """Position of the last take-off in world axes: east, north, up [m]; None if unknown."""
@@ -460,7 +460,7 @@ class Drone:
     def recent_events(self) -> list[Event]:
         """Return the last 256 events, oldest first."""
     def hover(self) -> bool:
-        """Stop and hold the position. Return values and exceptions are those of all commands; see :class:`Drone`."""
+        """Stop and hold the position. For return values and exceptions, see :class:`Drone`."""
     def idle(self) -> bool:
         """Keep the authority and leave the vehicle as it is."""
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
@@ -490,11 +490,11 @@ class Drone:
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle reports it
-        (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
+        Requires ``access="pilot"`` but not the authority. The stop is sent at once and repeated until the vehicle
+        reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
-        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        connections must itself stop the others from sending. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
             False if the link is down and the stop can't be sent now.
@@ -507,7 +507,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not yet reported this application's stop, the reset is sent as soon as it has, within 2 s.
         """
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
@@ -526,7 +526,7 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
 
-        Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
+        Thread-safe. Returns at once, without requiring the authority. Refusals cause events (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
@@ -628,7 +628,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest ``depth`` unseen frames.
+            function: Called in its own thread with the newest unseen frames, at most ``depth`` of them.
             camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
@@ -651,20 +651,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> client.Listener[EncodedFrame]:
-        """Call ``function`` with a camera's encoded pictures, to store or forward them.
+        """Call ``function`` with a camera's encoded frames, to store or forward them.
 
         Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
-        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
-        ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it doesn't send H.264, encoded by
-        the proxy at the rate that the network path can carry.
+        key frame. After a loss, a key frame is requested from the proxy and delivered next. Without ``kbit_s``,
+        ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
+        the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
-            max_fps: Maximum pictures per second; None: all.
+            kbit_s: Rate at which the proxy encodes [kbit/s], once for all clients with the same request.
+            max_fps: Maximum number of frames per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if there are more, some are lost.
+            depth: How many frames may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -696,7 +696,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop.
+        It is called on the event loop or, with ``inline``, on the receiving thread.
         """
     def on_feedback(
         self,
@@ -713,10 +713,10 @@ class Drone:
         :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called on the event loop; feedback overtaken by newer feedback is dropped and counted.
+            function: Called on the event loop; feedback replaced by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
-                another consumer requests more.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer does not receive more than that
+                unless another consumer requests more.
         """
     def on_event(self, function: Callable[[Event], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with each event, including the client's own (number 0).
@@ -725,18 +725,18 @@ class Drone:
 
         Args:
             function: Called on the event loop; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
+            inline: Call it on the receiving thread instead. For the client's own events, this is the thread that emits
                 them.
         """
     def on_link(self, function: Callable[[LinkStatus], object | Awaitable[object]]) -> Listener:
-        """Call ``function``, on the event loop, whenever one of the two hops changes state; up to 256 changes wait.
+        """Call ``function`` on the event loop whenever one of the hops changes state; up to 256 changes may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop.
         """
     def on_command(
         self, function: Callable[[Applied], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
+        """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -745,14 +745,14 @@ class Drone:
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
     ) -> Listener:
-        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
+        """Call ``function`` with the annotations that applications draw on frames; up to 256 of them may wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
         It is called on the event loop.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
-        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
+        """Call ``function`` with the log entries (``drone.log``) of all applications, also this one; up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -767,7 +767,7 @@ class Drone:
         depth: int | None = None,
         inline: bool = False,
     ) -> Listener:
-        """Call ``function`` with the results of one processor, or of all.
+        """Call ``function`` with the results of one processor or of all processors.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
@@ -806,8 +806,8 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
-    task at a time may await them; :meth:`emergency_stop` may be called at any time.
+    :meth:`emergency_stop` are coroutines. :meth:`feedback` is a coroutine too, because ``on_error`` may require a
+    landing. Only one task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
     sync: client.Swarm
@@ -829,21 +829,21 @@ class Swarm:
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
         """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
-        It is a coroutine function. Its exceptions, ``what`` and the result are as for :meth:`skyloop.Swarm.each`.
+        A coroutine function. Exceptions, ``what`` and the result are the same as for :meth:`skyloop.Swarm.each`.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
-        """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
+        """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
-        ends, by its time, a ``break``, an exception or Ctrl-C, drones still flying its velocities or attitudes hover at
-        once, because no newer ones would follow.
+        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts from its end.
+        When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or
+        attitudes that it sent hover at once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
             seconds: Duration [s]; None: until the loop ends.
 
         Raises:
-            UsageError: If ``rate_hz`` is out of range, at the first iteration.
+            UsageError: If ``rate_hz`` is out of range; raised by the first iteration.
         """
     async def close(self) -> None:
         """End all connections. Does not land. Idempotent.
@@ -856,7 +856,7 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
         Args:
-            wait: Wait until each hovers.
+            wait: Wait until every drone hovers.
             timeout_s: How long to wait [s].
         """
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
@@ -881,8 +881,8 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Nothing keeps the drones apart on the way: use :class:`skyloop.control.formation_flight.Formation` to plan safe
-        paths. Drones that are set aside are left out.
+        Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
+        paths. Drones that are set aside are skipped.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -908,7 +908,7 @@ class Swarm:
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
-            land: Land there, otherwise hover above it; None: each drone's ``return.land``.
+            land: Whether to land there instead of hovering above it; None: each drone's ``return.land``.
             wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
             timeout_s: How long to wait [s].
 
@@ -966,11 +966,11 @@ class Swarm:
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
         """
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone with its name, all sent together.
+        """Make each action the newest set-point of the drone it is for, sending them all at once.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        Drones that are set aside are skipped. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -998,7 +998,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Arguments are those of :meth:`Drone.request_authority`.
+        The arguments are those of :meth:`Drone.request_authority`.
         """
     async def release_authority(self) -> None:
         """Release the authority over all active drones.
@@ -1018,10 +1018,10 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that don't meet it have failed.
 
         Args:
-            wanted: A flight state or its name, several of them, or a predicate on feedback.
+            wanted: A flight state or its name, several of these, or a predicate on feedback.
             timeout_s: How long to wait [s].
 
         Returns:
@@ -1037,7 +1037,7 @@ class Swarm:
         """Names of all drones, including those set aside."""
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones do not take part, by name: those set aside and those that never connected."""
+        """The reasons why drones do not take part, by name: drones that were set aside or never connected."""
     def readmit(self, *names: str) -> None:
         """Reactivate drones that were set aside.
 
@@ -1051,11 +1051,11 @@ class Swarm:
         """Cut the motors of all drones at once, including those set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some, whatever ``on_error`` is.
+            SwarmError: If the command could not be sent to some drones, whatever the value of ``on_error``.
         """
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of a :meth:`send` [s]; None before the first."""
+        """Time between the first and the last command of each :meth:`send` [s]; None before the first call."""
     def __len__(self) -> int: ...
     def __contains__(self, name: object) -> bool: ...
 
@@ -1076,8 +1076,8 @@ def connect(
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
-    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
-    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
+    60 s, it returns anyway, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -1085,8 +1085,8 @@ def connect(
             up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
-            an address, and then 60 s for the vehicle.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and
+            20 s for an address, followed by 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that

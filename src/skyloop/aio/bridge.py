@@ -27,12 +27,12 @@ from skyloop.messages import Encoding
 
 T = TypeVar("T")
 Opened = TypeVar("Opened", bound=AbstractAsyncContextManager[Any, Any])
-#: A callback of an asyncio application: a function or a coroutine function. It runs on the event loop.
+#: A callback in an asyncio application: a function or a coroutine function. It runs on the event loop.
 Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class LoopNotifier(Notifier):
-    """Wakes the coroutine that waits in :meth:`within`, from any thread."""
+    """Wakes, from any thread, the coroutine that waits in :meth:`within`."""
 
     __slots__ = ("_loop", "_notified")
 
@@ -73,7 +73,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
-    outside = cancelled.get()  # whether an outer thread that waits for this coroutine was cancelled
+    outside = cancelled.get()  # whether an outer thread waiting for this coroutine has been cancelled
 
     def work() -> None:
         result, error = None, None
@@ -92,14 +92,14 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
     try:
         return await future
     except asyncio.CancelledError:
-        # Cancelled in the same iteration of the event loop in which the result arrived, which nothing else will see.
+        # Cancelled in the iteration of the event loop in which the result arrived, so nothing else receives it.
         if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
             threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
         raise
 
 
 def from_thread(function: Callback[T]) -> Callable[[T], Any]:
-    """Wrap ``function`` for calls from another thread: it runs on this event loop, and the call waits for it."""
+    """Wrap ``function`` so that another thread can call it and wait while it runs on this event loop."""
     loop = asyncio.get_running_loop()
 
     async def call(sample: T) -> object:
@@ -112,11 +112,11 @@ def from_thread(function: Callback[T]) -> Callable[[T], Any]:
     return wait
 
 
-# Ways to turn a member of a synchronous class into one of an asyncio class; all keep names, defaults and docstrings ---
+# Functions that turn a synchronous member into an asyncio one, keeping its name, defaults and docstring --------------
 
 
 def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
-    """Decorate an asyncio class with members of ``kind``, made in different ways, each of which has a row of names."""
+    """Decorate an asyncio class with members of ``kind``; ``rows`` maps each way of making one to their names."""
 
     def fill(face: type[T]) -> type[T]:
         for way, names in rows.items():
@@ -175,7 +175,7 @@ def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Calla
 
 
 def like(member: Any, text: str = "") -> Callable[[T], T]:
-    """Give a hand-written method the docstring of its counterpart, with an additional paragraph."""
+    """Give a hand-written method the docstring of its counterpart, followed by an extra paragraph."""
 
     def explain(function: T) -> T:
         function.__doc__ = member.__doc__
@@ -185,7 +185,7 @@ def like(member: Any, text: str = "") -> Callable[[T], T]:
 
 
 def _forwarded(member: Any) -> Callable[..., Any]:
-    """Call the method, or read the property, of the wrapped object."""
+    """Return a function that calls the method, or reads the property, of the wrapped object."""
     reads = isinstance(member, property)
     function = member.fget if reads else member
 
@@ -210,7 +210,7 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
     own: Any = made
     own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
     own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
-    del own.__wrapped__  # otherwise its annotations would be used
+    del own.__wrapped__  # otherwise its annotations would take precedence
     return made
 
 
@@ -277,11 +277,11 @@ class Drone:
     Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
     Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
     callbacks are the exception: they are plain functions in their own threads, because image processing would block the
-    event loop. So is the predicate of :meth:`wait`.
+    event loop. The predicate of :meth:`wait` is a plain function, too.
     """
 
     sync: client.Drone  #: the wrapped drone
-    config: Config  #: parameters of the vehicle and the proxy
+    config: Config  #: parameters of the vehicle and of the proxy
 
     def __init__(self, sync: client.Drone) -> None:
         """Wrap a connected drone."""
@@ -351,8 +351,8 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
-    task at a time may await them; :meth:`emergency_stop` may be called at any time.
+    :meth:`emergency_stop` are coroutines. :meth:`feedback` is a coroutine too, because ``on_error`` may require a
+    landing. Only one task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
     sync: client.Swarm  #: the wrapped swarm
@@ -389,7 +389,7 @@ class Swarm:
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
         """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
 
-        It is a coroutine function. Its exceptions, ``what`` and the result are as for :meth:`skyloop.Swarm.each`.
+        A coroutine function. Exceptions, ``what`` and the result are the same as for :meth:`skyloop.Swarm.each`.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
@@ -408,7 +408,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # otherwise they would keep commanding after a cancellation, in conflict with the next commands
+        finally:  # otherwise, after a cancellation, they would go on commanding and conflict with the next commands
             over = True
             for waiting in begun:
                 waiting.cancel()
@@ -453,7 +453,7 @@ class Opening(Generic[Opened]):
 
 
 def _reject_in_step(target: object) -> None:
-    """Raise an error for a stepped replay, whose time would never advance here."""
+    """Raise an error for a stepped replay, in which time would never advance here."""
     if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
         raise UsageError(
             f"{target}: speed=max advances only while a thread waits, which an event loop never does: use "

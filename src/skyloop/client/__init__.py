@@ -1,4 +1,4 @@
-"""The application's side: :func:`skyloop.connect` returns a :class:`skyloop.Drone`."""
+"""The application's side of the connection: :func:`skyloop.connect` returns a :class:`skyloop.Drone`."""
 
 from skyloop.client.authority import Authority as Authority
 from skyloop.client.authority import AuthorityState as AuthorityState

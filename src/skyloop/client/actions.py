@@ -1,6 +1,6 @@
-"""An application's actions: how their numbers are checked, when they are complete and when they are sent. Pure.
+"""An application's actions: checks of their numbers, when they are complete and when they are sent. Pure.
 
-The newest set-point wins: it is sent at once and then repeated at a steady rate on absolute deadlines, unless a newer
+The newest set-point wins: it is sent at once and then repeated at a steady rate with absolute deadlines, unless a newer
 one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
 leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
 """
@@ -38,11 +38,11 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
-AT_REST_M_S: Final = 0.3  #: a vehicle slower than this at its target has arrived
+AT_REST_M_S: Final = 0.3  #: a vehicle at its target and slower than this has arrived
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: maximum age of feedback used to convert a geographic position
 OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the action may be requested again
-OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: fates of actions that the application itself ended
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: outcomes of actions that the application itself ended
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
 #: States that complete an action if the proxy reports no outcome; a complete action is no longer sent.
@@ -53,7 +53,7 @@ _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     ReturnToStart: frozenset({FlightState.LANDED}),
     ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
 }
-#: Minimum time for which these actions are repeated, because the known state may predate the command.
+#: Minimum time for which these actions are repeated, because the last known state may be older than the command.
 _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(0.3),
     Land: nanoseconds(0.3),
@@ -62,15 +62,15 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     ResetEmergency: nanoseconds(0.1),
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
-    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s and reports whether it may be requested again
-    Land: nanoseconds(60.0),  # counted from the proxy's last report that it is in progress
+    Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
+    Land: nanoseconds(60.0),  # counted from the last time the proxy reports it in progress
     EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
-_MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two set-points, not counting repeats
-_KEEP_NS: Final = nanoseconds(0.5)  #: maximum age at which a set-point that could not be sent is still sent later
+_MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two new set-points, not counting repeats
+_KEEP_NS: Final = nanoseconds(0.5)  #: a set-point that could not be sent is still sent later if it is at most this old
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
-_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval at which a stop is repeated, whatever the rate of other commands
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval between repeats of a stop, whatever the rate of other commands
 
 
 def checked(action: AnyAction) -> AnyAction:
@@ -108,7 +108,7 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start; for None, the proxy's parameters decide.
+    """Return the action that flies back to the start; the proxy's parameters replace values of None.
 
     Raises :class:`UsageError` if a value is not a number or bool, or makes no sense.
     """
@@ -122,7 +122,7 @@ def return_action(height_m: object, land: object) -> ReturnToStart:
 def in_world_axes(
     local: tuple[object, object, object], earth: tuple[object, object, object], newest: Feedback | None, age_s: float
 ) -> tuple[object, object, object]:
-    """Return x, y, z [m] of a target given in one of two forms; the values of the other form are None.
+    """Return x, y, z [m] of a target given in one of two ways; the values of the other are None.
 
     ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m],
     None for the current height. Raises :class:`UsageError` if both forms or neither are given, or a value is not a
@@ -137,7 +137,7 @@ def in_world_axes(
     latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
     if not is_on_earth(latitude_deg, longitude_deg):
         raise UsageError(
-            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
+            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within ±89.9 and ±180"
         )
     origin = None if newest is None else newest.origin
     if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
@@ -187,10 +187,10 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
 
 
 class ReturnWatch:
-    """Decides whether a return is over. Call it with each new sample of feedback."""
+    """Decides whether a return flight is over. Call it with each new sample of feedback."""
 
     def __init__(self) -> None:
-        """Start before the command is sent."""
+        """Prepare the watch; call this before the command is sent."""
         self._began = False
 
     def __call__(self, feedback: Feedback) -> bool:
@@ -201,7 +201,7 @@ class ReturnWatch:
 
 
 class Unsent(NamedTuple):
-    """A one-off request that the transport had no room for."""
+    """A one-off request that could not be sent because the transport had no room."""
 
     action: AnyAction
     intent: int
@@ -213,10 +213,10 @@ class CommandSchedule:
     """Stores the newest set-point of one application. Times are on this process's clock."""
 
     def __init__(self, *, rate_hz: float = 32.0, stall_s: float = 1.0) -> None:
-        """Start without a set-point; repeat at 1 to 200 Hz. Raises :class:`UsageError` if an argument is out of range.
+        """Start without a set-point; repeat later ones at 1 to 200 Hz. Raises :class:`UsageError` for invalid values.
 
         After ``stall_s`` without a call, a velocity or attitude decays to hover; ``math.inf``: never. Flights to a
-        target and returns do not decay: the vehicle stops there.
+        target and return flights do not decay: the vehicle stops there.
         """
         if not 1.0 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
@@ -227,8 +227,8 @@ class CommandSchedule:
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
         self.automatic = False  #: whether the newest set-point is the library's own
-        self.over: Outcome | None = None  #: what ended it, once it has ended
-        self.owed: Unsent | None = None  #: a one-off request that was not sent
+        self.over: Outcome | None = None  #: how the newest intent ended; None while it has not
+        self.owed: Unsent | None = None  #: a one-off request that could not be sent yet
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
@@ -236,14 +236,14 @@ class CommandSchedule:
         self._first_ns = self._period_ns * 5 // 4
         self._new_sent_ns = -_MIN_INTERVAL_NS  # time at which the newest intent was first sent
         self._sent_intent = 0
-        self.due_ns = 0  #: time from which :meth:`next` has something to send
+        self.due_ns = 0  #: time at which :meth:`next` will have something to send
         self._failsafe = Failsafe.NONE
-        self._reset_asked_ns: int | None = None  # during a stop
+        self._reset_asked_ns: int | None = None  # when a reset was requested while a stop was active
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
-        """Make ``action``, which :meth:`may_ask` allows, the set-point; return the number of this intent.
+        """Make ``action``, already allowed by :meth:`may_ask`, the set-point; return the number of this intent.
 
-        ``automatic``: the library's own action, not the application's.
+        ``automatic``: whether the library, rather than the application, requests it.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -255,7 +255,7 @@ class CommandSchedule:
         self.latest[type(action)] = self.intent
         self.automatic = automatic
         self._asked_ns = now_ns
-        if stops or type(action) in _DONE_IN:  # rare and important, so send it at once
+        if stops or type(action) in _DONE_IN:  # these are rare and important, so send them at once
             self.due_ns = now_ns
         else:
             self.due_ns = max(now_ns, self._new_sent_ns + _MIN_INTERVAL_NS)
@@ -263,7 +263,7 @@ class CommandSchedule:
 
     @property
     def stopping(self) -> bool:
-        """Whether an emergency stop is in progress, which only another one may replace; see :meth:`may_ask`."""
+        """Whether an emergency stop is in progress, which only another stop may replace; see :meth:`may_ask`."""
         return isinstance(self.action, EmergencyStop)
 
     def may_ask(self, action: AnyAction) -> bool:
@@ -271,7 +271,7 @@ class CommandSchedule:
 
         An emergency stop is repeated until the vehicle reports it, or for 8 s. Until then, this application sends
         nothing else; otherwise a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
-        that was never sent. A reset is sent once the vehicle has reported the stop, if it does so soon.
+        that was never sent. A reset is sent once the vehicle has reported the stop, provided that it reports it soon.
         """
         if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
@@ -279,11 +279,11 @@ class CommandSchedule:
 
     @property
     def open_ns(self) -> int:
-        """Time from which a new set-point is sent at once [ns]."""
+        """When a new set-point may next be sent without delay [ns]."""
         return self._new_sent_ns + _MIN_INTERVAL_NS
 
     def next(self, now_ns: int) -> AnyAction | None:
-        """Return the action to send now, under the current :attr:`intent`; None if it is too early."""
+        """Return the action to send now under the current :attr:`intent`; None if nothing is due yet."""
         if now_ns < self.due_ns:
             return None
         kind, since_ns, is_sent = type(self.action), now_ns - self._asked_ns, self.intent == self._sent_intent
@@ -307,17 +307,17 @@ class CommandSchedule:
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Record that the result of :meth:`next` was not sent. A later set-point replaces it unless it is a landing."""
+        """Record that the action from :meth:`next` was not sent. A new set-point replaces it unless it is a landing."""
         if isinstance(action, EmergencyStop):
-            if self._new_sent_ns == now_ns:  # its first attempt: it may still be withdrawn, and is abandoned soon
+            if self._new_sent_ns == now_ns:  # first attempt: it may still be withdrawn, and is abandoned soon
                 self._sent_intent = -1
         elif not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if ``action`` neither repeats nor revokes it, so that it must be sent first.
+        """Return :attr:`owed` if it must be sent first because ``action`` neither repeats nor revokes it.
 
-        The library's own actions revoke everything except a landing.
+        Actions by the library itself revoke everything except a landing.
         """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > _KEEP_NS:
@@ -327,23 +327,23 @@ class CommandSchedule:
         return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
-        """Return whether the set-point ``before`` has decayed to hover because the application made no calls."""
+        """Return whether the set-point ``before`` has decayed to hover for lack of calls by the application."""
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
-        """End the set-point if the proxy reports its intent as ended, or a failsafe has overruled it."""
+        """End the set-point if the proxy reports that its intent has ended, or if a failsafe has overruled it."""
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
         if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
             if outcome.over:
                 self._end(outcome)
             elif kind is Land and feedback.state is not FlightState.UNKNOWN:
-                self._asked_ns = now_ns  # the proxy continues it, however long it takes
+                self._asked_ns = now_ns  # the proxy continues the landing, however long it takes
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
         elif (
-            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; any pilot may stop
+            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; any pilot may trigger a stop
             and feedback.state in done_in
             and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         ):
@@ -368,7 +368,7 @@ class CommandSchedule:
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
         """Resume sending on the connection made at ``connected_ns``, without a set-point that is too old."""
-        if now_ns - self._asked_ns > _KEEP_NS:  # on this connection, only the lease was missing
+        if now_ns - self._asked_ns > _KEEP_NS:  # the connection has stayed the same, and only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

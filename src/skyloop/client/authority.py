@@ -1,4 +1,4 @@
-"""Track this application's authority by replies, events and feedback, and answer requests to hand it over.
+"""Track this application's authority from replies, events and feedback, and answer requests to hand it over.
 
 Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow with each grant.
 """
@@ -57,40 +57,40 @@ class Authority:
 
 
 def check_seconds(what: str, seconds: object) -> None:
-    """Check a time to wait [s]; raise :class:`UsageError` if it is negative or not a finite number."""
+    """Check a waiting time [s]; raise :class:`UsageError` if it is negative or not a finite number."""
     if not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
         raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
 
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """This application's right to command."""
+    """The state of this application's right to command a drone."""
 
     #: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command. ``preempted``:
     #: taken over by another application; waiting in the queue to get it back.
     state: AuthorityState = "none"
     lease: int = 0  #: number of the lease while held, otherwise 0
     priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
-    holder: str | None = None  #: name of the application that holds it; None if there is none or it is unknown
+    holder: str | None = None  #: name of the application that holds it; None: none, or unknown
     position: int = 0  #: position in the queue, 1 being next; 0 if unknown
-    expected_wait_s: float | None = None  #: if all those ahead keep to their announced times [s]; None if unknown
-    until_ns: int | None = None  #: end of the time that was requested, on the proxy's clock; None: unlimited
+    expected_wait_s: float | None = None  #: if all requests ahead keep to their announced times [s]; None if unknown
+    until_ns: int | None = None  #: when the requested time ends, on the proxy's clock; None: unlimited
 
 
 class EndedSessions:
-    """Ended sessions of this process, by run of the proxy and number of the application. Thread-safe.
+    """This process's finished sessions, by run of the proxy and number of the application. Thread-safe.
 
     A proxy may not notice that a session has ended before the next one begins; until then, it still has the authority.
     """
 
-    MOST = 256  #: number of remembered sessions
+    MOST = 256  #: maximum number of sessions remembered
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, int], None] = {}
         self._lock = threading.Lock()
 
     def add(self, run_id: int, app_id: int) -> None:
-        """Remember a session; forget the oldest one."""
+        """Remember a session, forgetting the oldest one if there are too many."""
         with self._lock:
             self._known[run_id, app_id] = None
             if len(self._known) > self.MOST:
@@ -103,7 +103,7 @@ class EndedSessions:
 class AuthorityTracker:
     """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
-    #: For this long after a grant, feedback without an owner may predate it.
+    #: Time after a grant during which feedback without an owner may predate the grant.
     SETTLE_NS = nanoseconds(0.5)
 
     def __init__(self, name: str, ended: EndedSessions | None = None) -> None:
@@ -112,12 +112,12 @@ class AuthorityTracker:
         self._run_id = 0
         self._owner_id = 0  # the owner in the last feedback; 0: none
         self.app_id = 0
-        self.wanted = False  #: the application requested it and has not released it
-        self.pending = False  #: requested on this connection, but not answered yet
+        self.wanted = False  #: whether the application has requested the authority and not released it
+        self.pending = False  #: the authority was requested on this connection, but no answer has arrived yet
         self.status = AuthorityStatus()
         self.last_request = RequestAuthority()  #: the last request, which is repeated on a new connection
         self.declined = ""  #: why the holder declined
-        #: Whether to request it again automatically after a lost connection, or after losing the lease by silence.
+        #: Whether to request the authority again automatically after losing the connection, or the lease by time-out.
         self.renews = True
         self._lease = 0  #: the newest lease that this application has held on this connection
         self._granted_ns = 0
@@ -129,33 +129,33 @@ class AuthorityTracker:
 
     @property
     def awaited(self) -> bool:
-        """Whether it is requested and, as far as is known, held by no other application."""
+        """Whether the authority is requested and, as far as is known, not held by another application."""
         return self.wanted and (self.status.state == "none" or not self.settled)
 
     @property
     def answered(self) -> bool:
-        """Whether it is held, queued for, or no longer wanted. A lost link does not count as an answer."""
+        """Whether the authority is held, queued for, or no longer wanted. A lost link does not count as an answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)
 
     @property
     def behind_itself(self) -> bool:
-        """Whether it is only waiting for the proxy to notice that an earlier session of this process has ended."""
+        """Whether it is queued only until the proxy notices that an earlier session of this process has ended."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
     def settled(self) -> bool:
-        """Whether it is held, not wanted, or known from feedback to belong to another application."""
+        """Whether the authority is held, not wanted, or known from feedback to belong to another application."""
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection; older leases are invalid and, in another run, so are application numbers."""
+        """Reset on a new connection: older leases are invalid and, if the proxy was restarted, so are old numbers."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """Handle a lost connection, which ends the authority; it stays wanted if it is to be renewed."""
+        """Handle a lost connection, which ends the authority; if it is to be renewed, it is still wanted."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False
@@ -170,15 +170,15 @@ class AuthorityTracker:
         self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """Record a grant from a reply, an event or feedback; ignore one that has been lost since.
+        """Record a grant from a reply, an event or feedback, unless it has been lost in the meantime.
 
-        ``until_ns``: the end of its time, on the proxy's clock; None: unlimited, or known from before.
+        ``until_ns``: when the lease ends, on the proxy's clock; None: never, or as reported before.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
-            return False  # the late report of an old lease, which has been lost since
+            return False  # this is a late report of an old lease that has been lost since then
         if until_ns is None and lease == self._lease:
-            until_ns = self.status.until_ns  # feedback and some events do not repeat it
+            until_ns = self.status.until_ns  # feedback and some events do not repeat the time limit
         self._lease, self._granted_ns = lease, now_ns
         return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
@@ -206,19 +206,19 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
         lease = _whole(data.get("lease"))
-        late = self.status.state == "preempted" and lease == self._lease  # feedback has already shown the next holder
+        late = self.status.state == "preempted" and lease == self._lease  # feedback has already named the next holder
         if not ours or not (late or (self.held and lease >= self.status.lease)):
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # its time is over, so it is not requested again automatically
+            if data.get("reason") == "expired":  # the lease has run out, so it is not requested again automatically
                 return self.given_back()
             return self._lost(None)
         return False
 
     def feedback(self, feedback: Feedback, now_ns: int) -> bool:
-        """Update from the owner and the lease in feedback, in case events were lost."""
+        """Update the authority from the owner and the lease in feedback, in case events were lost."""
         before_id, self._owner_id = self._owner_id, feedback.owner_id
         if feedback.owner_id == self.app_id and feedback.lease:
             return (
@@ -230,7 +230,7 @@ class AuthorityTracker:
             newer = feedback.lease > self.status.lease
             until_ns = self.status.until_ns
             if newer and until_ns is not None and feedback.captured_ns >= until_ns:
-                return self.given_back()  # its time is over, and the event was lost or is late
+                return self.given_back()  # its time has run out, and the event was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):
@@ -238,7 +238,7 @@ class AuthorityTracker:
         return False
 
     def _lost(self, holder: str | None) -> bool:
-        """Record that ``holder`` took it over, or that the proxy ended it because this application was silent."""
+        """Record that ``holder`` took over, or that the proxy withdrew the authority because nothing was sent."""
         if not holder and not self.renews:
             return self.given_back()
         state: AuthorityState = "preempted" if holder else "none"
@@ -253,23 +253,23 @@ def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
 
 
-#: True hands it over; False, or a reason as text, declines; None leaves the decision to the proxy.
+#: True hands over the authority; False, or a reason as a string, declines; None leaves the decision to the proxy.
 TakeoverAnswer = bool | str | None
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverRequest:
-    """Another application's request for the authority that this one holds."""
+    """Another application's request for the authority held by this one."""
 
     by: str  #: name of the other application
     priority: int  #: 0 is the highest
     within_s: float  #: after this time [s], it wins if its priority is strictly higher
-    for_s: float | None  #: how long it wants to hold the authority; None: unlimited
+    for_s: float | None  #: how long the application wants to hold the authority [s]; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuery:
-    """A request as received, with the data needed to answer it."""
+    """A request as it was received, with the data needed to answer it."""
 
     request: TakeoverRequest
     lease: int  #: the lease to give up
@@ -292,9 +292,9 @@ def answering(
     app_id: Callable[[], int],
     answer: Callable[[int, int, bool, str], None],
 ) -> Callable[[Event], None]:
-    """Return a callback for events that calls ``function`` when this application is asked to hand the authority over.
+    """Return a callback for events that calls ``function`` when another application requests this one's authority.
 
-    ``answer`` is called with the lease, the number of the requesting application, the decision, and the reason. Raises
+    ``answer`` is called with the lease, the requesting application's number, the decision and the reason. Raises
     :class:`UsageError` if ``function`` can't be called.
     """
     if not callable(function):

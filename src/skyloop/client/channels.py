@@ -1,4 +1,4 @@
-"""Deliver samples from the receiving thread to consumers: channels, callbacks, and newest-wins mailboxes."""
+"""Pass samples from the receiving thread to consumers: channels, callbacks and newest-wins mailboxes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Emit(Protocol):
     def __call__(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None: ...
 
 
-JOIN_S: Final = 2.0  #: how long cancelling waits for a running call
+JOIN_S: Final = 2.0  #: how long cancelling waits for a call in progress [s]
 _REPORT_EVERY_S: Final = 1.0
 _log = logging.getLogger("skyloop")
 
@@ -43,8 +43,8 @@ class Channel(Generic[T]):
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
         """Create a channel without consumers.
 
-        Whenever samples begin or cease to be needed, ``subscribe`` is called with True or False, under the channel's
-        lock.
+        ``subscribe`` is called with True when samples begin to be needed and with False when they no longer are, while
+        the channel's lock is held.
         """
         self.subscribed = False  #: whether samples are needed, because there is a consumer or the channel is kept
         self.kept = False  #: subscribed permanently, by :meth:`keep`
@@ -55,7 +55,7 @@ class Channel(Generic[T]):
         self._subscribe = subscribe
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Add a consumer, called on the publishing thread; ``dropped`` returns how many samples it missed."""
+        """Add a consumer, to be called on the publishing thread; ``dropped`` returns how many samples it has missed."""
         with self._lock:
             self._drops[consumer] = dropped
             self._consumers = (*self._consumers, consumer)
@@ -72,7 +72,7 @@ class Channel(Generic[T]):
 
     @contextmanager
     def into(self, mailbox: Holder[T]) -> Iterator[None]:
-        """Deliver into ``mailbox`` during the block."""
+        """Deliver samples into ``mailbox`` during the block."""
         put = mailbox.put
         self.add(put, lambda: mailbox.dropped)
         try:
@@ -94,7 +94,7 @@ class Channel(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Samples that consumers missed, including consumers that have been removed."""
+        """Number of samples that consumers missed, including consumers since removed."""
         with self._lock:
             return self._dropped_before + sum(dropped() for dropped in self._drops.values())
 
@@ -104,7 +104,7 @@ class Channel(Generic[T]):
             consumer(sample)
 
     def _update(self) -> None:
-        """Subscribe or unsubscribe if that has changed. The lock is held."""
+        """Subscribe or unsubscribe if the need has changed. The lock is held."""
         wanted = self.kept or bool(self._consumers)
         if wanted is not self.subscribed:
             self.subscribed = wanted
@@ -115,11 +115,11 @@ class Channel(Generic[T]):
 class FollowingChannel(Channel[T], Generic[T, C]):
     """A channel that switches to another camera's channel if the proxy restarts with other cameras.
 
-    It serves callers that name no camera, and so use the vehicle's first. Consumers are added to the current channel.
+    Used by callers that don't name a camera, to get the vehicle's first. Consumers are added to the current channel.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Start with the result of ``find``, called again for each sample of ``changes``; later errors are ignored."""
+        """Start with the result of ``find``, called again after each sample of ``changes``, then ignoring errors."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -155,7 +155,7 @@ def _since(dropped: Callable[[], int], before: int) -> int:
 
 
 class Listener(Generic[T]):
-    """An application's callback, called with samples until :meth:`cancel` or the end of its block.
+    """An application's callback, which is called with samples until :meth:`cancel` or the end of its block.
 
     The function has its own thread and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
     samples and delays no other consumer. With ``inline=True`` it is called on the receiving thread, before the next
@@ -174,11 +174,11 @@ class Listener(Generic[T]):
         inline: bool = False,
         on_cancel: Callable[[Listener[T]], None] | None = None,
     ) -> None:
-        """Start calling ``function`` with each sample of ``channel``, of which ``depth`` may wait.
+        """Start calling ``function`` with each sample of ``channel``; up to ``depth`` samples may wait.
 
-        ``report`` is called with this listener's ``name``, which its thread has, too, and each exception of
-        ``function``; ``on_cancel`` with this listener. ``inline``: call the function on the publishing thread instead
-        of its own.
+        ``report`` is called with this listener's ``name``, which is also the name of its thread, and each exception of
+        ``function``; ``on_cancel`` is called with this listener. ``inline``: call the function on the publishing thread
+        instead of on its own.
         """
         self.name = name
         self.errors = 0  #: number of calls that raised
@@ -209,7 +209,7 @@ class Listener(Generic[T]):
         """Stop calling the function. Idempotent.
 
         Args:
-            wait: Wait up to 2 s for a call in progress; ignored if called from the function itself.
+            wait: Whether to wait up to 2 s for a call in progress; ignored if called from the function itself.
         """
         self._channel.remove(self._consumer)
         self._mailbox.close()
@@ -241,9 +241,9 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
-        except ClosedError:  # the drone was closed, or its flight ended: not an error of the function
+        except ClosedError:  # the drone was closed or its flight ended, which is not an error of the function
             self.errors += 1
-        except SystemExit as error:  # it would end only this thread, unnoticed
+        except SystemExit as error:  # otherwise it would only end this thread, unnoticed
             self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
@@ -252,14 +252,14 @@ class Listener(Generic[T]):
     def _failed(self, error: Exception) -> None:
         now_s = time.monotonic()
         if now_s < self._next_report_s:
-            return  # report at most once a second; ``errors`` counts all
+            return  # report at most once a second; ``errors`` counts every one
         self._next_report_s = now_s + _REPORT_EVERY_S
         _log.error("%s raised %r (%d times so far)", self.name, error, self.errors, exc_info=error)
         self._report(self.name, error)
 
 
 class Holder(Protocol[T_contra]):
-    """A target for samples: a mailbox, or several that are emptied together."""
+    """A destination for samples: a mailbox, or several that are emptied together."""
 
     def put(self, item: T_contra, /) -> None:
         """Add the newest item and wake the consumer."""
@@ -272,7 +272,7 @@ class Holder(Protocol[T_contra]):
 class Mailbox(Generic[T]):
     """Keeps the newest ``depth`` items until its consumer takes them, and counts the dropped ones.
 
-    Any number of threads may put items; one thread takes them.
+    Any number of threads may put items; only one takes them.
     """
 
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
@@ -324,10 +324,10 @@ class Mailbox(Generic[T]):
         return None if self.closed else self.take()
 
     def close(self) -> None:
-        """Discard all items, and wake the consumer, which gets None from now on."""
+        """Discard all items and wake the consumer, which then receives None."""
         self.closed = True
         with self._lock:
-            self._offered -= len(self._items)  # discarded items count as neither delivered nor dropped
+            self._offered -= len(self._items)  # discarded items are counted neither as delivered nor as dropped
             self._items.clear()
         self.notifier.notify()
 
@@ -335,8 +335,8 @@ class Mailbox(Generic[T]):
 class Notifier:
     """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
 
-    Each waiting thread adds its own lock, and then checks its condition once more. This way no notification is
-    missed, and the notifying thread, which receives for all consumers, never acquires a lock.
+    Each waiting thread adds its own lock and then checks its condition again. In this way, no notification is missed,
+    and the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
     __slots__ = ("_waiting",)
@@ -350,14 +350,14 @@ class Notifier:
         while waiting:
             try:
                 lock = waiting.pop()
-            except IndexError:  # another thread notified at the same time
+            except IndexError:  # another thread is notifying at the same time
                 return
             lock.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until ``ready()`` is true (without limit for None); return whether it became true in time.
 
-        ``ready`` is called on this thread, first at once and then after each notification.
+        ``ready`` is called on this thread, at once and then after each notification.
         """
         if ready():
             return True

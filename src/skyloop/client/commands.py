@@ -48,14 +48,14 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: How long to wait for the proxy to notice the end of an earlier session of this process; this exceeds the time-out
-#: of that session's lease.
+#: Time for the proxy to notice that an earlier session of this process has ended, which exceeds the time-out of that
+#: session's lease.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: An application's requests that an automatic hover by the library must not end.
 LANDING: Final = (Land, EmergencyStop)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: unknown to older proxies
-_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: fates after which the next set-point is most likely refused, too
+_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: outcomes after which the next set-point is most likely refused, too
 #: Actions that programs send continuously; failing to send one of them is not an error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
@@ -65,13 +65,13 @@ cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", defau
 
 
 class GivenUpError(Exception):
-    """Raised when the caller has stopped waiting; never leaves the library."""
+    """Raised when the caller has stopped waiting; caught within the library."""
 
 
 class CommandSender:
     """Requests and keeps the authority, and sends the newest command at once and then at a steady rate.
 
-    Its ``authority`` is changed by no other object.
+    No other object changes its ``authority``.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class CommandSender:
         changed: Callable[[], None],
         granted: Callable[[int], None],
     ) -> None:
-        """Prepare to send; nothing is sent before :meth:`connected`.
+        """Prepare for sending; nothing is sent before :meth:`connected` is called.
 
         ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
         ``granted`` with the number of each new lease, on the thread that noticed.
@@ -101,20 +101,20 @@ class CommandSender:
         self._granted = granted
         self._lock = threading.Lock()  # guards everything below; never held during a wait or a callback
         self._seq = 0
-        self._connected_ns = 0  # start of the current connection
+        self._connected_ns = 0  # when the current connection was made
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
-        self.barred = False  #: the flight is ending, so only the library's own commands and an emergency stop are sent
-        self._impossible: dict[type, str] = {}  # reasons for what neither vehicle nor proxy supports
+        self.barred = False  #: whether the flight is ending; only the library's own commands and stops are sent
+        self._impossible: dict[type, str] = {}  # by type: why neither vehicle nor proxy supports it
         self.told: Outcome | None = None  #: the proxy's newest report on this application's intents
-        self._first_set_point = 0  # number of the first in the current series of set-points; 0: there is none
+        self._first_set_point = 0  # number of the first intent in the current series of set-points; 0: there is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: counts commands sent; ``dropped``: those that were not handed to the transport
 
     @property
     def status(self) -> AuthorityStatus:
-        """This application's authority."""
+        """The state of this application's authority."""
         return self._authority.status
 
     @property
@@ -138,7 +138,7 @@ class CommandSender:
 
     @property
     def wants_flight(self) -> bool:
-        """Whether the newest set-point keeps the vehicle in the air or brings it there."""
+        """Whether the newest set-point keeps the vehicle in the air or makes it take off."""
         return self.schedule.wants_flight
 
     def bar(self) -> None:
@@ -149,7 +149,7 @@ class CommandSender:
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
-        After a lost connection or lease, only that person requests the authority again; nothing does so automatically.
+        If the connection or the lease is lost, only that person can request the authority again; nothing is automatic.
         """
         with self._lock:
             self._authority.renews = False
@@ -158,9 +158,9 @@ class CommandSender:
     def present_until(self, until_ns: int) -> None:
         """Extend the time until which the person flying is known to be present; never shortens it.
 
-        After that time, nothing is repeated, nothing new is flown and no authority is requested, so that the proxy
-        considers the pilot silent. Commands that end a flight are still sent once, and emergency stops as always. The
-        sending thread checks this itself, however busy other threads are.
+        After that time, nothing is repeated, no new flight is started and the authority is not requested, so that the
+        proxy considers the pilot absent. Commands that end a flight are still sent once, and emergency stops always.
+        The sending thread checks this itself, however busy other threads are.
         """
         with self._lock:
             known_ns = self._present_until_ns
@@ -168,8 +168,8 @@ class CommandSender:
                 return
             absent, schedule = known_ns < self._clock(), self.schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
-            ends = kind is Land or (kind is Hover and not schedule.automatic)  # by a person, who may be waiting for it
-            if absent and not ends:  # an old set-point must not be revived when the person returns
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # a person may be waiting for it
+            if absent and not ends:  # an old set-point must not come back into force when the person returns
                 schedule.clear(Fate.WITHDRAWN)
                 if kind in (Velocity, Attitude):
                     schedule.ask(Hover(), self._clock(), automatic=True)
@@ -183,22 +183,22 @@ class CommandSender:
     # For the application ---------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action``, with numbers already checked, the newest set-point; see :class:`skyloop.Drone`.
+        """Make ``action``, whose numbers have been checked, the newest set-point; see :class:`skyloop.Drone`.
 
         With ``now``, raise if it can't be sent at once; in that case only a landing is still sent later. ``automatic``:
-        it is the library's own, so it never takes a vehicle from others, and passes :meth:`bar`.
+        the library itself requests it, so it never takes a vehicle from others, and :meth:`bar` does not stop it.
 
         Raises:
-            ClosedError: Once the drone is closed, and from :meth:`bar` on.
+            ClosedError: If the drone is closed, or after :meth:`bar`.
             UnsupportedError: If neither the vehicle nor its proxy supports it.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
-                with ``now`` also while the authority is still awaited.
+                with ``now``, also if the request for the authority has not been answered yet.
             RefusedError: If an emergency stop blocks a one-off action, or any action with ``now``.
-            LinkError: With ``now`` while the link is down.
+            LinkError: If the link is down and ``now`` is True.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
-            # A new series of set-points starts after any other command: an earlier refusal says nothing about it.
+            # After any other command, a new series of set-points begins, to which an earlier refusal does not apply.
             self._first_set_point = 0
             return sent
         told = self.told
@@ -206,7 +206,7 @@ class CommandSender:
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
-        """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
+        """Make ``action`` the newest set-point like :meth:`command`, and return the number of the intent.
 
         :meth:`outcome` returns its outcome. ``again`` is the intent that it repeats under a new number; if another
         command has been given since, nothing is sent and the number stays the same.
@@ -218,7 +218,7 @@ class CommandSender:
     ) -> tuple[int, bool]:
         """Make ``action`` the newest set-point and send it if possible; return the intent and whether it was sent.
 
-        Sending is impossible while the link is down, the authority or an emergency stop's effect is awaited, or the
+        Nothing can be sent while the link is down, the authority or the effect of an emergency stop is awaited, or the
         person flying is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
         """
         connection, schedule, authority = self._connection, self.schedule, self._authority
@@ -229,7 +229,7 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            # Nothing changes before schedule.ask(): calls that raise or return earlier leave the set-point as it was.
+            # Nothing changes before schedule.ask(): calls that raise or return earlier leave the set-point unchanged.
             wanted = not automatic or type(action) is Takeoff  # the caller is still waiting for a repeated take-off
             if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
@@ -237,7 +237,7 @@ class CommandSender:
                 raise GivenUpError  # nothing was sent, so newer commands stay in force
             if again is not None and again != schedule.intent:
                 return again, False
-            # The library's own hover must not end the application's landing or stop.
+            # A hover requested by the library must not end the application's landing or stop.
             if automatic and type(action) is not Land and type(schedule.action) in LANDING:
                 return schedule.intent, False
             may_send, connected = authority.status.state == "held" or stop, connection.connected
@@ -251,21 +251,21 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
-            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within 0.5 s.
+            # From here on, the set-point is stored: if it can't be sent now, tick() may still send it within 0.5 s.
             absent = self._present_until_ns is not None and now_ns > self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
-                    if type(action) is not Land:  # a command that raised must not be executed later
+                    if type(action) is not Land:  # if this raises, the command must not be executed later
                         schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
                 return intent, False
             if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        connection.poke()  # too soon after the last command: the supervisor's thread sends this one
+        connection.poke()  # it is too soon after the last command, so the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
-        """Return the outcome of an intent that has ended; None while, as far as is known, it is in progress."""
+        """Return the outcome of an intent that has ended; None while it appears to be in progress."""
         with self._lock:
             if intent != self.schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
@@ -277,7 +277,7 @@ class CommandSender:
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
-        """Clear the set-point, so that it is not sent later."""
+        """Clear the set-point so that it is not sent later."""
         with self._lock:
             self.schedule.clear(Fate.WITHDRAWN)
 
@@ -322,8 +322,8 @@ class CommandSender:
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer an application that requests the authority; an answer that is too late has no effect.
 
-        With ``wait``, returns once the proxy has it, or raises :class:`RefusedError` if the authority is no longer
-        held, or :class:`LinkError`.
+        With ``wait``, returns once the proxy has the answer. Raises :class:`RefusedError` if the authority is no longer
+        held, and :class:`LinkError` if the link fails.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -332,7 +332,7 @@ class CommandSender:
             raise RefusedError(reply.message, code=reply.code.value)
 
     def release(self, *, wait: bool = True) -> None:
-        """Release the authority, or leave the queue. Does nothing if it is neither held nor requested.
+        """Release the authority, or leave the queue. Does nothing if the authority is neither held nor requested.
 
         With ``wait``, raises :class:`NoAnswerError` if the proxy does not answer.
         """
@@ -358,7 +358,7 @@ class CommandSender:
             self._seq, self._connected_ns = 0, self._clock()
 
     def disconnected(self) -> None:
-        """Clear the set-point and the authority, so that nothing old is sent on the next connection."""
+        """Clear the set-point and the authority so that nothing old is sent on the next connection."""
         with self._lock:
             self.schedule.clear(Fate.LINK)
             self.told = None
@@ -386,7 +386,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send everything due; return the latest time of the next call, on this process's clock [ns]."""
+        """Send everything that is due; return the deadline of the next call, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
             authority, schedule, present = self._authority, self.schedule, self.is_present(now_ns)
@@ -451,7 +451,7 @@ class CommandSender:
             elif isinstance(answer, Refused):
                 self._refusal = answer
                 changed = self._authority.given_back()
-            else:  # there was no answer, so the next tick requests it again
+            else:  # no answer arrived, so the next tick sends the request again
                 self._authority.pending = False
                 changed = False
         if changed:
@@ -517,7 +517,7 @@ def impossible(capabilities: Capabilities) -> dict[type, str]:
     found: dict[type, str] = {}
     if ACTION_NAMES[EmergencyStop] not in capabilities.actions:
         found[EmergencyStop] = "the vehicle cannot stop its motors"
-    for kind in _LATER_ACTIONS:  # older proxies can't even decode them
+    for kind in _LATER_ACTIONS:  # older proxies can't even decode these
         if ACTION_NAMES[kind] not in capabilities.actions | capabilities.software:
             found[kind] = (
                 f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a position; an older "

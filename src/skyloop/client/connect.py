@@ -27,20 +27,20 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
-WAKE_S: Final = 60.0  #: time limit for a vehicle to start up: no driver reports for longer that it is starting
+WAKE_S: Final = 60.0  #: time limit for a vehicle to start up, which no driver exceeds
 #: Entry-point group with a name per address scheme: functions that return a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
 #: Entry-point group for transports to proxies on other hosts: modules that implement :class:`NetworkTransport`.
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
-_OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output of the child before checking on it
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long the child waits for its vehicle to land
+_OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output from the child before checking whether it still runs
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: maximum time for which the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Where the options of earlier versions have moved.
+#: Where to pass options that earlier versions took directly.
 _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
     "keys": "network=skyloop.Network"
 }
@@ -48,7 +48,7 @@ _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A program's access to the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
+    """Where to find drones on other hosts: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
 
     Attributes:
         address: ``"10.0.0.5:7447"`` connects to an address (or several, separated by commas; ``multicast`` among them
@@ -62,7 +62,7 @@ class Network:
 
 
 class NetworkSettings(Protocol):
-    """Settings that only their :class:`NetworkTransport` creates and interprets."""
+    """Settings created and interpreted only by their own :class:`NetworkTransport`."""
 
     @property
     def reach(self) -> str:
@@ -127,8 +127,8 @@ def connect(
     """Connect to a drone.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
-    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s``, or
-    60 s, it returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
+    60 s, it returns anyway, and :meth:`Drone.takeoff` waits for the rest of the time.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -136,8 +136,8 @@ def connect(
             up first on this host and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and 20 s for
-            an address, and then 60 s for the vehicle.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and
+            20 s for an address, followed by 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
@@ -173,7 +173,7 @@ def prepare(
     network: NetworkChoice = None,
     **options: Unpack[DroneOptions],
 ) -> tuple[Drone, float]:
-    """Return an unconnected drone, and the deadline for its connection, on ``time.monotonic``.
+    """Return an unconnected drone and the deadline for connecting it (on ``time.monotonic``).
 
     Starts a private proxy if needed. Arguments and errors are those of :func:`connect`.
     """
@@ -184,7 +184,7 @@ def prepare(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
-        # Another process can use the bare name only if it finds the proxy without network settings.
+        # Other processes can use the bare name only if they find the proxy without network settings.
         options["reach"] = target if network is None or network is False else None
         return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
@@ -222,35 +222,35 @@ class Connector(Protocol):
         """The target for other processes to reach the same vehicle; None if they can't."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``."""
+        """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``."""
 
     def close(self) -> None:
-        """Stop everything started. Idempotent."""
+        """Stop everything that was started. Idempotent."""
 
 
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends. Before that, it lands a vehicle that is
-    still flying for us. Ctrl-C reaches only the application, which can then land.
+    The child ends on :meth:`close` and whenever this process ends, but first lands a vehicle that is still flying for
+    it. Ctrl-C reaches only the application, which can then land.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child; ``command`` is its command line without the address."""
+        """Start the child; ``command`` is its command line, to which the address is added."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
         self.uri = shown_address(uri)
         self.scheduler = Scheduler()
-        self._served = False  # whether it has served a client, and so may have a vehicle in the air
+        self._served = False  # whether it has served a client, and therefore may have a vehicle in the air
         self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer whose first call waits for the proxy, until ``deadline_s`` on ``time.monotonic``.
+        """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``.
 
-        The dialer raises :class:`NoAnswerError` if that takes too long, :class:`UsageError` if the address makes no
-        sense, and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
+        The dialer raises :class:`NoAnswerError` if this takes too long, :class:`UsageError` if the address is invalid,
+        and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
         """
         inner = _local(self.name)
 
@@ -294,7 +294,7 @@ class PrivateProxy:
         raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 
     def _wait_for_output(self) -> None:
-        """Sleep until the child prints something (such as its readiness), ends, or a moment has passed."""
+        """Sleep until the child prints something (such as its readiness), it ends, or a short time has passed."""
         stdout = self._process.stdout
         if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
             time.sleep(0.005)  # the child has closed its output and is about to exit

@@ -27,7 +27,7 @@ _log = logging.getLogger("skyloop")
 
 @dataclass(frozen=True, slots=True)
 class RedialPolicy:
-    """Policy for reconnecting to a lost proxy: attempts never end, and the pauses between them grow [s]."""
+    """Policy for reconnecting to a lost proxy: retry forever, with increasing pauses [s]."""
 
     first_s: float = 0.02
     factor: float = 2.0
@@ -47,7 +47,7 @@ class _EndedError(LinkError):
 class ProxyConnection:
     """Sends an application's packets and requests through the current session with the proxy. Thread-safe.
 
-    It is created before all its users; a :class:`ConnectionSupervisor` creates the sessions.
+    It is created before everything that uses it; a :class:`ConnectionSupervisor` creates the sessions.
     """
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
@@ -56,18 +56,18 @@ class ProxyConnection:
         self.state = LinkState.CONNECTING
         self.reason = ""
         self.why_closed = ""  #: why requests are not possible; empty while they are
-        self.poked = False  #: whether the supervisor must run now
+        self.poked = False  #: whether the supervisor must run immediately
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
         self._clock = clock
         self._topics: list[str] = []
-        self._lock = threading.Lock()  # guards the topics and the switch between sessions
-        self.session: ProxySession | None = None  #: the current one; switched under the lock
-        self._malformed_before = self._missing_before = 0  # totals of earlier sessions
+        self._lock = threading.Lock()  # guards the topics and the replacement of the session
+        self.session: ProxySession | None = None  #: the current session; replaced under the lock
+        self._malformed_before = self._missing_before = 0  # totals over earlier sessions
 
     @property
     def connected(self) -> bool:
-        """Whether, as far as is known, a proxy is at the other end and has answered Hello."""
+        """Whether a proxy is at the other end and has answered Hello, as far as is known."""
         session = self.session
         return session is not None and session.open
 
@@ -79,7 +79,7 @@ class ProxyConnection:
 
     @property
     def missing(self) -> int:
-        """Number of feedback samples missing in all sessions, judged by gaps in their numbers."""
+        """Number of feedback samples missing in all sessions, inferred from gaps in their sequence numbers."""
         session = self.session
         return self._missing_before + (0 if session is None else session.monitor.missing)
 
@@ -91,7 +91,7 @@ class ProxyConnection:
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive in the requested form; within one host, they arrive unchanged."""
+        """Whether frames arrive as requested; within one host, they arrive unchanged."""
         session = self.session
         return session is not None and session.variants
 
@@ -123,7 +123,7 @@ class ProxyConnection:
             raise UsageError("an inline callback can't wait for packets that it would itself have to receive")
 
     def poke(self) -> None:
-        """Wake the supervisor to attend to the connection now."""
+        """Wake the supervisor so that it attends to the connection now."""
         self.poked = True
         self.woken.notify()
 
@@ -167,8 +167,8 @@ class ProxyConnection:
     ) -> AnyReply:
         """Send a request and wait for the answer. While the link is lost, wait for it to return.
 
-        ``body`` returns the request, for each attempt, ``may_repeat`` whether to repeat it if the link breaks between
-        sending it and receiving the answer.
+        ``body`` returns the request and is called for each attempt. ``may_repeat``: whether to repeat it if the link
+        breaks between sending it and receiving the answer.
 
         Raises:
             NoAnswerError: If there is no answer in time.
@@ -200,7 +200,7 @@ class ProxyConnection:
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:
-        """Stop sending and waiting: the session belongs to the parent process."""
+        """Stop sending and waiting, because the session belongs to the parent process."""
         self.why_closed = (
             f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect again here"
         )
@@ -211,7 +211,7 @@ class ProxyConnection:
     # For the supervisor ----------------------------------------------------------------------------------------
 
     def attach(self, session: ProxySession) -> None:
-        """Send through ``session`` from now on, and subscribe to all active topics in it."""
+        """Send through ``session`` from now on, and subscribe it to all active topics."""
         with self._lock:
             for topic in self._topics:
                 session.subscribe(topic, True)
@@ -220,7 +220,7 @@ class ProxyConnection:
         self.poke()
 
     def detach(self) -> ProxySession | None:
-        """Stop sending until there is another session; return the previous one."""
+        """Stop sending until a new session is attached; return the previous one."""
         with self._lock:
             session, self.session = self.session, None
             self.transmit = _nowhere
@@ -244,9 +244,9 @@ class ConnectionSupervisor:
         clock: Clock = time.monotonic_ns,
         begin: Callable[[ConnectionSupervisor], None] | None = None,
     ) -> None:
-        """Prepare to connect; :meth:`start` connects.
+        """Prepare to connect; :meth:`start` makes the connection.
 
-        ``begin`` arranges for :meth:`attend` to be called from the first session on; if None, a thread calls it.
+        ``begin`` arranges calls of :meth:`attend` from the first session on; if None, a separate thread makes them.
         """
         self.connection = connection
         self._handler = handler
@@ -259,7 +259,7 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Connect for the first time, within ``timeout_s``, and stay connected from then on.
+        """Make the first connection, within ``timeout_s``, and stay connected from then on.
 
         Raises :class:`NoAnswerError` if the proxy does not answer Hello, :class:`RefusedError` if it refuses the
         connection, and the dialer's errors.
@@ -285,12 +285,12 @@ class ConnectionSupervisor:
         self.connection.poke()
         started, me = self._thread.ident, threading.get_ident()
         if started not in (None, me) and not self.connection.receiving:
-            self._thread.join()  # unless called from an inline callback or from the thread itself
+            self._thread.join()  # except when called from an inline callback or from the thread itself
         self._drop(ClosedError("this drone was closed"), "closed by the application")
         self._set_state(LinkState.CLOSED, "closed by the application")
 
     def attend_for_ever(self) -> None:
-        """Attend to the connection in a separate thread until :meth:`close`."""
+        """Maintain the connection on a separate thread until :meth:`close`."""
         self._thread.start()
 
     def attend(self) -> float:
@@ -324,7 +324,7 @@ class ConnectionSupervisor:
         return max(0.0, (due_ns - self._clock()) / 1e9)
 
     def _judge(self, session: ProxySession, now_ns: int) -> bool:
-        """Update the link's state; return False if the session was dropped."""
+        """Update the link's state; return False if the session has been dropped."""
         session.tick(now_ns)
         verdict = session.monitor.verdict(now_ns)
         reason = session.closed_reason or (verdict.reason if verdict.restart else None)
@@ -348,7 +348,7 @@ class ConnectionSupervisor:
         return 0.0
 
     def _connect(self) -> None:
-        """Dial and send Hello. The attempt counts as failed until feedback arrives; if it never does, pauses grow."""
+        """Dial and send Hello. The attempt counts as failed, lengthening the next pause, until feedback arrives."""
         self._failures += 1
         session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock, self._dial)
         try:
@@ -411,7 +411,7 @@ class ReceivingNotifier(Notifier):
         self._connection = connection
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true; see :meth:`Notifier.wait_for`. May take 50 ms longer than ``timeout_s``."""
+        """Wait until ``ready()`` is true, up to 50 ms longer than ``timeout_s``; see :meth:`Notifier.wait_for`."""
         deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not ready():
             left_s = deadline_s - time.monotonic()
@@ -432,19 +432,19 @@ def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
 
 
 class Scheduler:
-    """Provides a drone's time: here real time, in which waits sleep and a slow application misses samples.
+    """Provides a drone's time. Here it is real time: waits sleep, and an application that is too slow misses samples.
 
     A replay stepped by its application has a different scheduler, in which waiting advances the time.
     """
 
-    #: Whether callbacks always run on the receiving thread, so that each gets all samples.
+    #: Whether callbacks always run on the receiving thread, so that each receives every sample.
     in_step = False
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
         self.clock = clock
 
     def notifier(self) -> Notifier:
-        """Return a notifier for threads of the application that wait."""
+        """Return a notifier for waiting threads of the application."""
         return Notifier()
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:
@@ -456,4 +456,4 @@ class Scheduler:
         supervisor.attend_for_ever()
 
     def opened(self) -> None:
-        """Handle the end of connecting: the drone's state is known, and a pilot may command it."""
+        """Handle completion of the connection: the drone's state is known, and a pilot may command it."""

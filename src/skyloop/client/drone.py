@@ -95,7 +95,7 @@ DOWN: Final = frozenset({FlightState.LANDED})
 EVENT_DEPTH: Final = 256  #: maximum number of events, log entries and so on waiting for a slow callback
 WHOLE_S: Final = 1.0  #: time limit for a complete sample of feedback, if a reduced rate was requested [s]
 _CAMERA_CHECK_S: Final = 0.5  #: how often a thread waiting for a frame checks that its camera still exists
-_SOON_S: Final = 1.0  #: a vehicle that is still starting up after this time is reported in the log
+_SOON_S: Final = 1.0  #: time after which a vehicle that is still starting up is reported in the log
 _ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
 
@@ -108,7 +108,7 @@ class DroneOptions(TypedDict, total=False):
     stall_s: float  #: time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never
     on_exit: OnExit  #: what an airborne vehicle does at the end of the block
     policy: RedialPolicy | None  #: when to reconnect, and when a link counts as lost
-    scheduler: Scheduler | None  #: provides the time and the means to wait; None: real time
+    scheduler: Scheduler | None  #: provides the current time and ways to wait; None: real time
     on_close: Callable[[], None] | None  #: called at the end of :meth:`Drone.close`, on the closing thread
     reach: str | None  #: name or address at which other processes can reach the vehicle; None if they can't
 
@@ -123,7 +123,7 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **given)
         except TypeError as error:
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise  # not raised by the call itself
+                raise  # raised within the function, not by the call itself
             for unknown in given.keys() - known:
                 raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
             first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
@@ -135,7 +135,7 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
 def _all_finite(a: object, b: object, c: object, d: object) -> bool:
     """Return whether four values are floats that can be commanded unchanged, without calling :func:`number` for each.
 
-    False does not mean invalid: ints, or four huge floats whose sum overflows, may be fine.
+    False does not mean that they are invalid: ints, or four huge floats whose sum overflows, may be valid.
     """
     floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
     return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
@@ -146,16 +146,16 @@ class Drone:
 
     It is a context manager, and every method is thread-safe. At the end of its block, a drone that is in the air under
     this application's authority lands, and the authority is released. Once that end has begun, commands from
-    other threads raise :class:`ClosedError`, except for an emergency stop. A drone flown by others is left alone, and
-    one returning because its battery is low keeps returning. ``sys.exit()`` in a callback ends the flight in the same
-    way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during :meth:`land` the
-    landing continues. A call with ``wait=False`` has nothing to interrupt. A lost connection to the proxy is
-    re-established, however long that takes, and everything except old set-points is restored.
+    other threads raise :class:`ClosedError`, except for an emergency stop. A drone that others are flying is left
+    alone, and a drone returning because its battery is low continues to return. ``sys.exit()`` in a callback ends the
+    flight in the same way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during
+    :meth:`land` the landing continues. With ``wait=False``, there is nothing to interrupt. A lost connection to the
+    proxy is re-established, however long that takes, and everything except old set-points is restored.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
     it is sent at once and repeated at ``rate_hz`` until the next one. All commands except :meth:`takeoff` and
     :meth:`land` return True if the command was handed to the transport. They return False while the link is down or the
-    authority has not been granted yet; the command is sent once both are available, unless it is over 0.5 s old by
+    authority has not been granted yet; the command is sent once both are available, unless it is more than 0.5 s old by
     then. Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for
     example on the ground or while others fly the vehicle; events give the reason. Every command raises:
 
@@ -228,9 +228,9 @@ class Drone:
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
-        ``timeout_s`` is for the proxy to answer, to send its first feedback and, as a pilot, for the vehicle to start
-        up, for which it has ``wake_s`` once it may be commanded, if that is longer. With ``acquire=False``, a pilot
-        requests the authority later. Errors are those of :func:`skyloop.connect`.
+        ``timeout_s`` limits the wait for the proxy's answer, for the first feedback and, as a pilot, for the vehicle to
+        start up; once the vehicle may be commanded, starting up may take ``wake_s`` if that is longer. With
+        ``acquire=False``, a pilot does not request the authority yet. Raises the errors of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -298,7 +298,7 @@ class Drone:
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`clock_offset_ns` [ns], and thus of ages and delays; 0 with a shared clock."""
+        """Maximum error of :attr:`clock_offset_ns` [ns], and so of ages and delays; 0 if both use the same clock."""
         return self._connection.uncertainty_ns
 
     @property
@@ -331,7 +331,7 @@ class Drone:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay across all pilots, requested from the proxy with a wait of up to 0.2 s.
+        callback. Otherwise it is the delay for all pilots, which takes up to 0.2 s to request from the proxy.
         """
         found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
@@ -378,18 +378,18 @@ class Drone:
 
         A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
         it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
-        may decline. Once granted, the authority is kept: after a lost link it is requested again, and after a
-        pre-emption it returns when the other application releases it.
+        may decline. Once granted, the authority is kept: after the link is lost it is requested again, and after a
+        pre-emption it is regained when the other application releases it.
 
         Args:
-            priority: 0 (highest) to 31 (lowest); None: the priority of the last request.
-            wait_s: How long to wait in the queue [s].
+            priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
+            wait_s: Maximum time to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
             takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
-            stay: Stay in the queue after ``wait_s`` instead of raising.
+            stay: Whether to stay in the queue after ``wait_s`` instead of raising.
 
         Returns:
-            The status: held or, with ``stay``, possibly queued, with the position and the expected wait.
+            The status: held or, if ``stay`` is True, possibly queued, including the position and the expected wait.
 
         Raises:
             AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
@@ -403,7 +403,7 @@ class Drone:
         return self._commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
-        """Release the authority, or leave the queue, and wait for the proxy's confirmation.
+        """Release the authority or leave the queue, and wait until the proxy confirms it.
 
         Does nothing if the authority is neither held nor requested.
 
@@ -440,7 +440,7 @@ class Drone:
                 the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
                 reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't take off later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't take off later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
@@ -461,15 +461,15 @@ class Drone:
             NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
+            LinkError: If the link is down and ``wait`` is False; the landing is still sent within 0.5 s if possible.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
+            UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
         """
         self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
-        """Stop and hold the position. Return values and exceptions are those of all commands; see :class:`Drone`."""
+        """Stop and hold the position. For return values and exceptions, see :class:`Drone`."""
         return self._commands.command(Hover())
 
     def idle(self) -> bool:
@@ -534,7 +534,7 @@ class Drone:
         World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
         (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
         ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application goes silent: the vehicle stops there. It is held until the next
+        position does not decay when the application stops sending: the vehicle stops there. It is held until the next
         command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
         obstacles.
 
@@ -545,7 +545,7 @@ class Drone:
             latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
-            yaw: Yaw, counter-clockwise from x, reached on the way [rad]; None: keep the current yaw.
+            yaw: Yaw to reach on the way, counter-clockwise from x [rad]; None: keep the current yaw.
             speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
             wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
@@ -553,12 +553,12 @@ class Drone:
             tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
 
         Raises:
-            NoAnswerError: If it does not arrive in time; the message gives its state and, if known, the reason.
+            NoAnswerError: If it has not arrived in time; the message gives its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
                 ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't fly there later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
@@ -578,21 +578,21 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends the flight. Obstacles are not
         avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
-            land: Land there, otherwise hover above it; None: the parameter ``return.land``.
-            wait: Wait until it has landed, or hovers above its start; otherwise only send the command.
+            land: Whether to land there instead of hovering above it; None: the parameter ``return.land``.
+            wait: Whether to wait until it has landed, or hovers above its start, rather than only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it is not over in time; the message gives the vehicle's state and, if known, the reason.
+            NoAnswerError: If it has not ended in time; the message gives the vehicle's state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
                 flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: Without ``wait``, if the link is down; the vehicle won't return later, either.
+            LinkError: If the link is down and ``wait`` is False; the vehicle won't return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
@@ -602,11 +602,11 @@ class Drone:
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.
 
-        Needs no authority, only ``access="pilot"``. The stop is sent at once and repeated until the vehicle reports it
-        (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
+        Requires ``access="pilot"`` but not the authority. The stop is sent at once and repeated until the vehicle
+        reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
         ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
         return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
-        connections must silence the others itself. A stop that could not be sent for 2 s is not sent later.
+        connections must itself stop the others from sending. A stop that could not be sent for 2 s is not sent later.
 
         Returns:
             False if the link is down and the stop can't be sent now.
@@ -621,7 +621,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If the vehicle has not reported this application's stop yet, the reset is sent once it has, within 2 s.
+        If the vehicle has not yet reported this application's stop, the reset is sent as soon as it has, within 2 s.
         """
         return self._commands.command(ResetEmergency())
 
@@ -636,7 +636,7 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
 
-        Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
+        Thread-safe. Returns at once, without requiring the authority. Refusals cause events (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
@@ -693,11 +693,11 @@ class Drone:
     def overview(self, timeout_s: float = 2.0) -> Overview:
         """Return the newest overview of all vehicles in the proxy's process, with one row per vehicle.
 
-        Overviews are sent once a second and are much smaller than feedback, which helps applications that watch many
+        Overviews are sent once a second and are much smaller than feedback, so they suit applications that watch many
         vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
-            timeout_s: How long to wait for the first one [s].
+            timeout_s: How long to wait for the first overview [s].
 
         Raises:
             NoAnswerError: If none arrives in time, for example from an older proxy.
@@ -721,11 +721,11 @@ class Drone:
         return (self.now_ns - sample.captured_ns) / 1e9
 
     def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for unread feedback, and return the newest.
+        """Wait for feedback that has not been read yet, and return the newest.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples requested by other consumers are returned, too.
+            max_hz: As for :meth:`feedback`; samples requested by other consumers may be returned, too.
 
         Raises:
             NoAnswerError: If none arrives in time.
@@ -766,7 +766,7 @@ class Drone:
         return channel.picture(arrival)
 
     def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
-        """Wait for a frame that this method has not returned yet, and return the newest.
+        """Wait for a frame that this method has not returned yet, then return the newest one.
 
         The first call subscribes to the camera permanently.
 
@@ -784,7 +784,7 @@ class Drone:
         deadline = time.monotonic() + timeout_s
         waited_s = 0.0  # in a stepped replay the time waited for passes at once
         while True:
-            # Each time, because the proxy may have restarted with another camera.
+            # Look up the channel each time, because the proxy may have restarted with a different camera.
             channel = self._state.video.channel(camera)
             channel.keep()
             self._connection.check_may_wait()
@@ -803,16 +803,16 @@ class Drone:
     ) -> Iterator[Frame]:
         """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
-        Errors are raised by the first iteration, not by the call.
+        The first iteration raises the errors, not the call itself.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, so that n workers, with k from 0, can share the frames.
+                ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
                 ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
                 ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
-                with smaller and fewer pictures if that is low) or ``"raw"``; within one host, all frames are raw.
+                with smaller and fewer frames if that is low) or ``"raw"``; within one host, all frames are raw.
                 ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
 
         Raises:
@@ -885,10 +885,10 @@ class Drone:
         :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called in its own thread; feedback overtaken by newer feedback is dropped and counted.
+            function: Called in its own thread; feedback replaced by newer feedback is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer gets no more, unless
-                another consumer requests more.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer does not receive more than that
+                unless another consumer requests more.
         """
         channel = self._state.feedback_channel(_feedback_request(max_hz))
         return self._listen(channel, function, "feedback", inline=inline)
@@ -896,7 +896,7 @@ class Drone:
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
         """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
-        It is called in its own thread or, with ``inline``, on the receiving one.
+        It is called in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
@@ -905,31 +905,31 @@ class Drone:
 
         Args:
             function: Called in its own thread; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead or, for the client's own events, on the thread that emits
+            inline: Call it on the receiving thread instead. For the client's own events, this is the thread that emits
                 them.
         """
         return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
 
     def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
-        """Call ``function``, in its own thread, whenever one of the two hops changes state; up to 256 changes wait."""
+        """Call ``function`` in its own thread whenever one of the hops changes state; up to 256 changes may wait."""
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
-        """Call ``function`` with the proxy's echo of each command of any application; up to 256 echoes wait for it.
+        """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
-        """Call ``function`` with each application's drawings on frames; up to 256 drawings wait for it.
+        """Call ``function`` with the annotations that applications draw on frames; up to 256 of them may wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with each application's log entries, this one's included (``drone.log``); up to 256 wait.
+        """Call ``function`` with the log entries (``drone.log``) of all applications, also this one; up to 256 wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
@@ -947,7 +947,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest ``depth`` unseen frames.
+            function: Called in its own thread with the newest unseen frames, at most ``depth`` of them.
             camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
@@ -983,20 +983,20 @@ class Drone:
         depth: int = 30,
         inline: bool = False,
     ) -> Listener[EncodedFrame]:
-        """Call ``function`` with a camera's encoded pictures, to store or forward them.
+        """Call ``function`` with a camera's encoded frames, to store or forward them.
 
         Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
-        key picture. After a loss, a key picture is requested from the proxy and delivered next. Without ``kbit_s``,
-        ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it doesn't send H.264, encoded by
-        the proxy at the rate that the network path can carry.
+        key frame. After a loss, a key frame is requested from the proxy and delivered next. Without ``kbit_s``,
+        ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
+        the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate at which the proxy encodes, once for all clients with the same request [kbit/s].
-            max_fps: Maximum pictures per second; None: all.
+            kbit_s: Rate at which the proxy encodes [kbit/s], once for all clients with the same request.
+            max_fps: Maximum number of frames per second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
-            depth: How many pictures may wait, at least 1; if there are more, some are lost.
+            depth: How many frames may wait, at least 1; if there are more, some are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -1122,7 +1122,7 @@ class Drone:
         depth: int | None = None,
         inline: bool = False,
     ) -> ResultListener:
-        """Call ``function`` with the results of one processor, or of all.
+        """Call ``function`` with the results of one processor or of all processors.
 
         Args:
             function: Called in its own thread.
@@ -1152,10 +1152,10 @@ class Drone:
     def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
         """Run the pre-flight checklist; each finding comes with a reason and a remedy.
 
-        Reads the proxy's parameters and requests a picture from each camera. Doesn't fly and needs no authority.
+        Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
 
         Args:
-            video_s: Total time to wait for pictures [s]; 0: don't check cameras.
+            video_s: Total time to wait for frames [s]; 0: don't check cameras.
             folder: Folder for recordings, to check its free space; None: don't check.
 
         Raises:
@@ -1167,7 +1167,7 @@ class Drone:
         state = self._state
         before = None if state.demand.request.is_plain else state.newest
         with state.demand.wanted(PLAIN):
-            if before is not None:  # a reduced rate was requested: wait for a complete sample
+            if before is not None:  # if a reduced rate was requested, wait for a complete sample
                 state.notifier.wait_for(lambda: state.newest is not before, WHOLE_S)
             return inspect(self, state.newest, video_s, folder)
 
@@ -1181,18 +1181,18 @@ class Drone:
             return
         self._piloting.finish_stop()
         self._connection.why_closed = "this drone was closed: connect again"
-        self._commands.notifier.notify()  # from here on, no thread gets the authority
+        self._commands.notifier.notify()  # from here on, no thread can acquire the authority
         try:
             if self._connection.connected:
                 self._commands.release(wait=not self._connection.receiving)
         except LinkError:
-            pass  # the link is already lost, and the authority with it
+            pass  # the link is already lost, and with it the authority
         finally:
             self._supervisor.close()
             listeners = list(self._state.listeners)
             for listener in listeners:
                 listener.cancel(wait=False)
-            deadline_s = time.monotonic() + JOIN_S  # shared by all of them
+            deadline_s = time.monotonic() + JOIN_S  # the time limit is shared by all of them
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
             for close in list(self._state.to_close):
@@ -1208,7 +1208,7 @@ class Drone:
     def __exit__(self, *_: object) -> None:
         problem = self._piloting.end_flight()
         if problem is not None:
-            _log.warning("%s could not be left as it should: %s", self.name, problem)
+            _log.warning("%s could not be left properly: %s", self.name, problem)
 
     def __repr__(self) -> str:
         return f"<Drone {self.name or '?'} ({self._connection.state.value}, authority {self.authority.state})>"
@@ -1253,9 +1253,9 @@ def open_drone(
     authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
-    """Connect through a dialer, now and again after each loss; applications call :func:`skyloop.connect`.
+    """Connect through a dialer, and reconnect after each loss; applications call :func:`skyloop.connect`.
 
-    ``app`` is the application's name, 1 to 64 characters; for the others, see there and :class:`DroneOptions`.
+    ``app``: the application's name, 1 to 64 characters. For the rest, see :func:`connect` and :class:`DroneOptions`.
     """
     drone = Drone(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, authority=authority)

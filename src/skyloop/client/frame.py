@@ -32,7 +32,7 @@ else:
     _Base = np.ndarray
 
 HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
-_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display pictures at once and rarely keep them
+_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display images at once and rarely keep them
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
@@ -53,7 +53,7 @@ class Frame(_Base):
 
     @property
     def header(self) -> FrameHeader:
-        """The header of the pixels."""
+        """The header received with the pixels."""
         return self._arrival.header
 
     @property
@@ -95,13 +95,13 @@ class Frame(_Base):
     def feedback(self) -> Feedback | None:
         """The vehicle's state at the time of capture, interpolated between the samples before and after it.
 
-        Until the later sample arrives, it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if unknown.
+        Until the later one arrives, this is the earlier one unchanged; see :attr:`feedback_reach_s`. None if unknown.
         """
         return self._arrival.state_at_capture()[0]
 
     @property
     def feedback_reach_s(self) -> float | None:
-        """Time between the capture and the more distant sample used for :attr:`feedback` [s]; None if there is none."""
+        """Time from the capture to the farther sample used for :attr:`feedback` [s]; None if there are no samples."""
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
@@ -109,7 +109,7 @@ class Frame(_Base):
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:
-        """Return the picture as PNG for display in a notebook; None for a slice that is not a picture."""
+        """Return the image as PNG for display in a notebook; None for a slice that is not an image."""
         return png(np.asarray(self))
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
@@ -144,7 +144,7 @@ def png(image: NDArray[Any]) -> bytes | None:
 
 
 class Arrival:
-    """A received frame. The first consumer that needs the image decodes it, in its own thread, for all."""
+    """A received frame. The first consumer that needs the image decodes it in its own thread, on behalf of all."""
 
     __slots__ = (
         "_clock",
@@ -170,10 +170,10 @@ class Arrival:
         clock: Clock = time.monotonic_ns,
         scale: float = 1.0,
     ) -> None:
-        """Store a frame received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
+        """Store a frame received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
-        ``history`` provides the state at the time of capture. A frame larger than its consumer requested is scaled
-        down by the factor ``scale`` for width and height when it is decoded.
+        ``history`` provides the state at the time of capture. When a frame larger than its consumer
+        requested is decoded, its width and height are multiplied by ``scale``.
         """
         self.header = self._full = header
         if scale != 1.0:
@@ -214,7 +214,7 @@ class Arrival:
                 self._pixels = None
             frame = self._image.view(Frame)
             frame._arrival = self
-            self._frame = weakref.ref(frame)  # weak, because the frame refers to this object: no reference cycle
+            self._frame = weakref.ref(frame)  # weak, to avoid a reference cycle: the frame refers to this object
             return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
@@ -231,9 +231,9 @@ class Arrival:
 
 
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
-    """Return a frame as a JPEG, to store many of them; :meth:`Arrival.frame` decodes it.
+    """Return a frame compressed as a JPEG, for storing many of them; :meth:`Arrival.frame` decodes it.
 
-    Raises :class:`MissingExtraError` without OpenCV, and :class:`LinkError` if that could not encode it.
+    Raises :class:`MissingExtraError` if OpenCV is not installed, and :class:`LinkError` if encoding fails.
     """
     from_ = frame._arrival
     plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
@@ -282,7 +282,7 @@ class FeedbackHistory:
         self._samples: deque[Feedback] = deque(maxlen=depth)
 
     def add(self, sample: Feedback) -> None:
-        """Add a sample; if it was captured before the newest one (by a restarted proxy), start the history over."""
+        """Add a sample; if it is older than the newest (the proxy was restarted), start the history over."""
         samples = self._samples
         if samples and sample.captured_ns < samples[-1].captured_ns:
             samples.clear()
@@ -291,8 +291,8 @@ class FeedbackHistory:
     def at(self, captured_ns: int) -> tuple[Feedback | None, float | None, bool]:
         """Return the state at a time on the proxy's clock, its reach [s], and whether there was a sample on each side.
 
-        The reach is the time to the more distant sample used. With samples on one side only, the state is the nearest
-        sample unchanged; with none, state and reach are None.
+        The reach is the time from ``captured_ns`` to the more distant of the samples used. With samples on one side
+        only, the state is the nearest sample unchanged; without any, state and reach are None.
         """
         samples = list(self._samples)
         if not samples:
@@ -309,9 +309,9 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Interpolate the state at a time between two samples linearly, with angles along the shorter way.
+    """Interpolate the state at a time linearly between two samples, with angles taking the shorter way round.
 
-    Fields that only one of them has, or that can't be interpolated (states, names), come from the nearer one.
+    Fields that only one of the two has, or that can't be interpolated (states, names), are taken from the nearer one.
     """
     share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
     nearer = a if share < 0.5 else b
@@ -340,7 +340,7 @@ def _number(a: float | None, b: float | None, share: float) -> float | None:
 def _angle(a: float | None, b: float | None, share: float) -> float | None:
     if a is None or b is None:
         return a if share < 0.5 else b
-    turn = math.remainder(b - a, math.tau)  # within [-π, π]: the shorter way
+    turn = math.remainder(b - a, math.tau)  # within [-π, π], so the shorter way round
     return math.remainder(a + turn * share, math.tau)
 
 

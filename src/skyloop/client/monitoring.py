@@ -1,4 +1,4 @@
-"""Evaluate a connection by arrival times: the link to the proxy, its clock, and statistics. Pure."""
+"""Evaluate a connection from the arrival times of packets: the link to the proxy, its clock, statistics. Pure."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ DEPTH: Final = 1024  #: number of samples stored per channel, a power of two
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """When a link counts as degraded and as lost."""
+    """Thresholds for a link to count as degraded or as lost."""
 
-    late_s: float = 0.3  #: time without feedback before the link is degraded
+    late_s: float = 0.3  #: time without feedback after which the link counts as degraded
     silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
     missing_share: float = 0.1  #: fraction of missing or malformed samples in the last window that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: malformed packets within a window that make the link lost and reconnected
+    malformed: int = 5  #: malformed packets in a window at which the link counts as lost and is reconnected
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The monitor's assessment of the arrivals so far."""
+    """The monitor's assessment of the packets received so far."""
 
     state: LinkState
     reason: str
@@ -41,39 +41,39 @@ class Verdict:
 
 _Counts = tuple[int, int, int]  #: at_ns, received, missing: a time and the totals at that time
 
-#: Maximum silence tolerated because of a low feedback rate [s]; links with even lower rates are checked by pings.
+#: Maximum gap tolerated because of a low feedback rate [s]; links with even lower rates are checked by pings.
 MAX_PATIENCE_S: Final = 2.0
 WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the fraction of missing ones
 
 
 class LinkMonitor:
-    """Monitors one connection. :meth:`verdict` does the work; the other methods only write a few attributes.
+    """Monitors one connection. :meth:`verdict` does the work; the other methods only set a few attributes.
 
-    Samples carry consecutive numbers: a gap, minus the samples that the proxy left out to lower the rate, is a loss.
+    Samples have consecutive numbers: a gap, less the samples that the proxy skipped to lower the rate, is a loss.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
         self._limits = thresholds
-        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ping
+        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: time without data after which to ping
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
-        self._no_gaps_ns = 0  # until then, gaps may result from a changed request
-        self.received_ns = now_ns  #: when any valid packet last arrived
+        self._no_gaps_ns = 0  # gaps before this time may result from a changed request
+        self.received_ns = now_ns  #: when the last valid packet arrived
         self.feedback_ns = 0  #: when feedback last arrived; 0 if never
         self.received = 0  #: number of feedback samples received
-        self.missing = 0  #: number of samples missing, judged by gaps in their numbers
+        self.missing = 0  #: number of samples missing, inferred from gaps in their sequence numbers
         self.malformed_count = 0
         self._last_seq: int | None = None
         self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
     def excuse(self, silence_s: float) -> None:
-        """Tolerate this much more silence [s] before the link counts as lost, for networks with pauses."""
+        """Extend the time without data before the link counts as lost by this much [s], for networks with pauses."""
         self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
         self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
-        """Set the expected time between two feedback samples [s]; 0 if all are sent."""
+        """Set the expected time between two feedback samples [s]; 0 if all of them are sent."""
         limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
         # Switching loses no samples, but leaves a gap in the numbers, and the first new sample takes a while.
         self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
@@ -86,9 +86,9 @@ class LinkMonitor:
         self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
 
     def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
-        """Record a feedback sample; the proxy left out ``skipped`` samples before it.
+        """Record a feedback sample, before which the proxy skipped ``skipped`` samples.
 
-        Returns False if it is a duplicate or was overtaken by a newer one.
+        Returns False if it is a duplicate or arrived after a newer one.
         """
         self.received_ns = now_ns
         last = self._last_seq
@@ -96,7 +96,7 @@ class LinkMonitor:
             if seq <= last:
                 return False
             gap = seq - last - 1
-            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy left out as many before each missing one, too
+            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy skipped as many before each missing one, too
                 self.missing += -((skipped - gap) // (skipped + 1))
         self._last_seq = seq
         self.feedback_ns = now_ns
@@ -108,7 +108,7 @@ class LinkMonitor:
         self.malformed_count += 1
 
     def verdict(self, now_ns: int) -> Verdict:
-        """Return the current state and its reason. Call it about twenty times a second."""
+        """Return the current state and its reason. Call this about twenty times a second."""
         received, missing, malformed = self._window(now_ns)
         silent_ns = now_ns - self.received_ns
         if silent_ns > self._silent_ns:
@@ -141,7 +141,7 @@ class LinkMonitor:
 class StallWatch:
     """Detects that one channel has stalled while others deliver, so that it can be resubscribed.
 
-    After a silence of all channels, the measurement starts over, because this channel may be the last to resume.
+    If all channels have been without data, the measurement starts over, because this channel may be the last to resume.
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
@@ -149,10 +149,10 @@ class StallWatch:
         self._patience_ns = nanoseconds(patience_s)
         self.received_ns = now_ns  #: when this channel last delivered
         self._asked_ns = now_ns
-        self._flow_ns = now_ns  # start of the period in which the others have been delivering
+        self._flow_ns = now_ns  # when the others last resumed delivering
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
-        """Return whether to resubscribe now; True at most once in ``patience_s``."""
+        """Return whether to resubscribe now; True at most once every ``patience_s``."""
         if not others_flow:
             self._flow_ns = now_ns
         if now_ns - max(self.received_ns, self._asked_ns, self._flow_ns) <= self._patience_ns:
@@ -169,16 +169,16 @@ class Offset:
     uncertainty_ns: int = 0
 
 
-_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: time on our clock, since when the bounds have widened
+_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: a time on our clock, from which the two bounds widen
 
 
 class OffsetEstimator:
     """Estimates the offset between two monotonic clocks from round trips.
 
     The proxy wrote its answer between sending and receiving, which bounds the offset regardless of the delay in each
-    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds of a round trip widen over time with
-    the possible drift of the clocks, and the truth lies within the bounds of all round trips (Marzullo and Owicki,
-    "Maintaining the time in a distributed system", 1983).
+    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds from a round trip widen over time with
+    the possible drift of the clocks, and the true offset lies within the bounds of all round trips (Marzullo and
+    Owicki, "Maintaining the time in a distributed system", 1983).
     """
 
     def __init__(self, depth: int = 16, max_drift: float = MAX_DRIFT) -> None:
@@ -203,7 +203,7 @@ class OffsetEstimator:
         for trip in reversed(self._trips):
             low, high = self._bounds(trip, now_ns)
             if max(low, low_ns) > min(high, high_ns):
-                break  # a clock was set, or drifts too fast: ignore older round trips
+                break  # a clock was set or drifts too fast, so ignore older round trips
             low_ns, high_ns = max(low, low_ns), min(high, high_ns)
         return Offset((low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2)
 
@@ -230,14 +230,14 @@ class ChannelStats:
 
     count: int = 0  #: samples received; for commands, commands sent
     rate_hz: float = 0.0  #: samples per second, over the last two seconds
-    lost: int = 0  #: missing, judged by gaps in their numbers; for video including those that the proxy left out
-    #: Replaced by newer ones before their consumer took them; for commands, those that the transport did not accept.
+    lost: int = 0  #: missing samples, according to gaps in their numbers; for video, including those the proxy skipped
+    #: Samples replaced by newer ones before their consumer took them; for commands, those the transport rejected.
     dropped: int = 0
     malformed: int = 0  #: undecodable samples
-    #: From publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
+    #: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
     delay_s: Distribution | None = None
     age_s: float | None = None  #: time since the newest sample's capture
-    uncertainty_s: float = 0.0  #: maximum error of both from comparing two hosts' clocks; 0 on one host
+    uncertainty_s: float = 0.0  #: maximum error of both, from comparing two hosts' clocks; 0 on a single host
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
@@ -267,11 +267,11 @@ class ChannelCounter:
         self.lost = 0
         self.dropped = 0
         self.malformed = 0
-        self.captured_ns: int | None = None  #: capture time of the newest sample, on our clock
+        self.captured_ns: int | None = None  #: capture time of the newest sample, on this process's clock
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """Count a sample with these times of capture and arrival on this process's clock."""
+        """Count a sample that was captured and arrived at these times on this process's clock."""
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -288,7 +288,7 @@ class ChannelCounter:
     def stats(
         self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
     ) -> ChannelStats:
-        """Return the statistics at ``now_ns``; the arguments are added to the counts here.
+        """Return the statistics at ``now_ns``, with the arguments added to the numbers counted here.
 
         ``ages``: whether ``age_s`` is meaningful for this channel.
         """

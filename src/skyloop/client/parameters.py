@@ -36,11 +36,11 @@ _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusa
 
 
 class Restorer:
-    """Rewrites parameters after a restart of the proxy, which loses the application's values.
+    """Writes parameters again after a restart of the proxy, which has lost the values set by the application.
 
-    It rewrites only values, never momentary parameters, and only if no other application can have written since: a
-    lost link alone changes nothing at the proxy, and other pilots' newer values stay. Each run of the proxy numbers its
-    leases from 1, so a gap between two of ours means that another application held the authority and may have written.
+    Rewrites only lasting values, never momentary parameters, and only if no other application can have written since:
+    losing the link changes nothing at the proxy, and other pilots' newer values are kept. A proxy numbers its leases
+    from 1, so a gap between two of ours means that another application held the authority and may have written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
@@ -50,7 +50,7 @@ class Restorer:
         self._written: dict[str, Value] = {}
         self._run_id = 0
         self._lease = 0  # our last lease in this run of the proxy
-        self._missed = False  # the connection was lost since that lease, so events may be missing
+        self._missed = False  # whether the connection was lost after that lease, so that events may be missing
         self._restore = False  # the proxy has restarted since the values were written
 
     def written(self, parameter: Parameter) -> None:
@@ -65,7 +65,7 @@ class Restorer:
             self._written.pop(name, None)
 
     def connected(self, run_id: int) -> None:
-        """Handle a new connection, to this run of the proxy."""
+        """Handle a new connection to the run of the proxy that has this number."""
         with self._lock:
             self._missed = True
             if run_id != self._run_id:
@@ -92,7 +92,7 @@ class Restorer:
         def done(answer: AnyReply | LinkError) -> None:
             if isinstance(answer, LinkError):
                 with self._lock:
-                    self._restore = True  # lost again: retried with the next grant
+                    self._restore = True  # the link was lost again: retry after the next grant
             elif isinstance(answer, Refused):
                 text = f"{name} could not be restored to {value!r}: {answer.message}"
                 self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
@@ -104,9 +104,9 @@ class Config(Mapping[str, Value]):
     """Parameters as a mapping from name to value; each access is a request to the proxy.
 
     ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
-    restarted proxy forgets written values; they are rewritten with the next grant of the authority, unless another
-    application held it in between. Momentary parameters, such as a flip, never are. Every method waits for the proxy's
-    answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    restarted proxy forgets written values; they are written again when the authority is next granted, unless another
+    application held it in between. Momentary parameters, such as a flip, are never rewritten. Every method waits for
+    the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:

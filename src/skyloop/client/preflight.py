@@ -21,11 +21,11 @@ from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
-STALE_S: Final = 1.0  #: maximum age of current feedback [s]
+STALE_S: Final = 1.0  #: maximum age for feedback to count as current [s]
 STALE_VIDEO_S: Final = 1.0
 CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
-LEVEL_RAD: Final = 0.12  #: maximum tilt of a vehicle that counts as level [rad]
-ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, on vehicles that send one at a time
+LEVEL_RAD: Final = 0.12  #: maximum tilt at which a vehicle counts as level [rad]
+ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
 FULL_BYTES: Final = 100_000_000
@@ -37,18 +37,18 @@ class Level(StrEnum):
 
     OK = "ok"
     WARN = "warn"  #: it can fly, but lacks something helpful
-    FAIL = "fail"  #: it would not fly, or not safely
+    FAIL = "fail"  #: it would not fly at all, or not safely
 
 
 @dataclass(frozen=True, slots=True)
 class PreflightFinding:
-    """One line of the checklist."""
+    """One finding of the pre-flight checklist."""
 
     check: str  #: the subject: ``link``, ``battery``, ``position`` and so on
     level: Level  #: how serious the finding is
     detail: str  #: the result
     why: str = ""  #: why it matters; empty if all is well
-    remedy: str = ""  #: what to do about it; empty if nothing
+    remedy: str = ""  #: what to do about it; empty if there is nothing to do
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +59,14 @@ class PreflightState:
     capabilities: Capabilities
     feedback: Feedback | None = None  #: the newest sample; None if there is none yet
     feedback_age_s: float | None = None
-    #: Age of each camera's newest picture; None: none arrived in time.
+    #: Age of each camera's newest frame; None if none arrived in time.
     video_age_s: Mapping[str, float | None] = field(default_factory=dict)
-    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty: they were not read
+    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty if they were not read
     clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
     app_id: int = 0  #: this application's number in this run of the proxy
-    free_bytes: int | None = None  #: free space of the disk for recordings; None: not requested
-    video_waited_s: float = 0.0  #: time spent waiting for pictures
-    name: str = "NAME"  #: the drone's name, for commands in remedies
+    free_bytes: int | None = None  #: free space on the disk for recordings [bytes]; None: not requested
+    video_waited_s: float = 0.0  #: time spent waiting for frames
+    name: str = "NAME"  #: the drone's name, used in the commands that remedies suggest
 
 
 class Inspected(Protocol):
@@ -97,7 +97,7 @@ def inspect(
     except ClosedError:
         raise
     except SkyloopError:
-        parameters = {}  # the link is not up, which is a finding in itself
+        parameters = {}  # the link is not up, which is reported as a finding
     shown = shown_cameras(drone.capabilities, parameters)
     return check_before_flight(
         PreflightState(
@@ -117,7 +117,7 @@ def inspect(
 
 
 def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
-    """Return the age of a picture of each camera; None if none arrived in time. Waits only for shown cameras."""
+    """Return the age of a frame from each camera; None if none arrived in time. Waits only for cameras in ``shown``."""
     deadline = time.monotonic() + timeout_s
     ages: dict[str, float | None] = {camera.name: None for camera in drone.capabilities.cameras}
     came = {name: threading.Event() for name in ages}
@@ -160,7 +160,7 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
-    # Drivers and the checks above give advice for any drone; with the drone's name, its commands can be copied.
+    # Drivers and the checks above give advice without the drone's name; with it, users can copy the commands.
     return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
@@ -169,7 +169,7 @@ def _ok(check: str, detail: str) -> PreflightFinding:
 
 
 def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
-    """Return a finding with this level; a good one has neither a reason nor a remedy."""
+    """Return a finding at this level; at level OK, it has neither a reason nor a remedy."""
     return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 
@@ -360,7 +360,7 @@ def _video(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return the cameras whose pictures a vehicle sends at present: all, or the selected one."""
+    """Return the cameras whose images a vehicle currently sends: all of them, or the selected one."""
     names = tuple(camera.name for camera in capabilities.cameras)
     chosen = parameters.get(ACTIVE)
     return (chosen,) if isinstance(chosen, str) and chosen in names else names
@@ -408,7 +408,7 @@ def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
-    """Yield the driver's findings."""
+    """Yield the findings of the vehicle's driver."""
     text = state.parameters.get(CHECKUP)
     if not isinstance(text, str) or not text:
         return

@@ -41,7 +41,7 @@ MAX_DIMENSIONS: Final = 8  #: maximum number of dimensions of an array in the lo
 class Logbook:
     """Publishes text, numbers and arrays. Thread-safe; no method waits.
 
-    Each method returns whether everything was handed to the transport, and raises :class:`UsageError` for values that
+    Each method returns whether all of it was handed to the transport, and raises :class:`UsageError` for values that
     can't be logged. Names of series have 1 to 64 characters.
     """
 
@@ -53,9 +53,9 @@ class Logbook:
         """Publish a line of text.
 
         Args:
-            text: At most 4096 characters.
-            name: Name of its series, if any.
-            severity: Severity, or its name.
+            text: The text, at most 4096 characters.
+            name: Name of the series that it belongs to, if any.
+            severity: Severity of the entry, or its name.
         """
         if name != "":
             _named(name)
@@ -78,7 +78,7 @@ class Logbook:
         return sum(self._send(name, number=value) for name, value in known) == len(known)
 
     def array(self, name: str, values: ArrayLike, *, at_ns: int | None = None) -> bool:
-        """Publish an array of the series ``name``.
+        """Publish an array as the next sample of the series ``name``.
 
         Args:
             name: Name of the series.
@@ -127,8 +127,8 @@ def _finite(name: str, value: object) -> float:
 class Membership:
     """One worker of a processor; created by :func:`skyloop.extend.join_processor`.
 
-    Ends with :meth:`close`, and with the drone. The proxy forgets a worker when its connection ends; the worker rejoins
-    automatically after a reconnection.
+    It ends on :meth:`close` and when the drone is closed. The proxy forgets a worker when its connection ends; the
+    worker rejoins automatically after a reconnection.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, even after the proxy restarts."""
+        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, also after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
@@ -150,11 +150,11 @@ class Membership:
         self._find = find
         self.code = code
         self.shared = shared
-        #: Called at each renewal; returns whether this worker can take frames. False gives its share to the others.
+        #: Called at each renewal; returns whether this worker can take frames; if not, the others get them.
         self.ready: Callable[[], bool] = lambda: True
-        #: The newest share; None while unknown. Set on the receiving thread.
+        #: This worker's newest share of the frames; None while unknown. Set on the receiving thread.
         self.share: ProcessorShare | None = None
-        #: Called on the receiving thread when the share has changed.
+        #: Called on the receiving thread when this worker's part has changed.
         self.changed: Callable[[ProcessorShare], None] | None = None
         self.refused: SkyloopError | None = None  #: why it is no longer a worker
         self._connection = connection
@@ -190,7 +190,7 @@ class Membership:
     def publish(self, frame: Frame, value: Any, took_s: float = 0.0) -> bool:
         """Publish the value found in a frame (see :func:`skyloop.messages.relayed.pack`) and the time it took [s].
 
-        Returns whether it was handed to the transport. Raises :class:`UsageError` if the value can't be sent.
+        Returns whether the result was handed to the transport. Raises :class:`UsageError` if the value can't be sent.
         """
         payload = pack(value)
         result = ProcessorResult(
@@ -206,9 +206,9 @@ class Membership:
         return self._connection.transmit(encode(result))
 
     def close(self) -> None:
-        """End the membership. Idempotent.
+        """Leave the group of workers. Idempotent.
 
-        The proxy gives its share to the other workers once renewals stop, or at once when the drone is closed.
+        The proxy gives its frames to the other workers once renewals stop, or at once when the drone is closed.
         """
         self._leave()
         self._ended = True
@@ -244,7 +244,7 @@ class Membership:
 
     def _welcomed(self, welcome: Welcome) -> None:  # noqa: ARG002  (signature of the topic's callbacks)
         self.share = None
-        with suppress(SkyloopError):  # no such camera, which the proxy's answer reports as well
+        with suppress(SkyloopError):  # there is no such camera, which the proxy's answer reports as well
             self.camera = self._find()
         self._wake.set()
 

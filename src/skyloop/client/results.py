@@ -33,7 +33,7 @@ class Result:
     def __init__(
         self, header: ProcessorResult, received_ns: int, offset_ns: int, history: FeedbackHistory, clock: Clock
     ) -> None:
-        """Store a result received at ``received_ns`` on ``clock``, which is ``offset_ns`` behind the proxy's.
+        """Store a result received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
         ``history`` provides the state at the time of capture. The value is decoded on first access.
         """
@@ -52,7 +52,7 @@ class Result:
 
     @property
     def worker(self) -> int:
-        """Number of the application that produced it, in this run of the proxy."""
+        """Number of the application that produced the result, in this run of the proxy."""
         return self.header.worker
 
     @property
@@ -89,7 +89,7 @@ class Result:
     def value(self) -> Any:
         """The return value of ``process``, with dataclasses as dicts, tuples as lists, and read-only arrays.
 
-        Raises :class:`DecodeError` if the payload is malformed, which only a foreign program can send.
+        Raises :class:`DecodeError` if the payload is malformed, which only happens if another program sent it.
         """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
@@ -120,17 +120,17 @@ class ResultMailbox:
     """Keeps the newest result of each processor for one consumer; skips results that are too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
-        """Create an empty mailbox that skips results older than ``max_age_s`` [s] when taken."""
+        """Create an empty mailbox. When results are taken, those older than ``max_age_s`` [s] are skipped."""
         self.notifier = notifier or Notifier()
-        self.expired = 0  #: results that were too old when their turn came
+        self.expired = 0  #: number of results that were too old when their turn came
         self.closed = False
         self._max_age_s = max_age_s
         self._mailboxes: dict[str, Mailbox[Result]] = {}
 
     def put(self, result: Result) -> None:
-        """Add a result, only on the receiving thread. Overtaken results are ignored."""
+        """Add a result. Call only on the receiving thread. Results that arrive after newer ones are ignored."""
         if result.overtaken:
-            return  # counted by its channel
+            return  # it is counted by its channel
         mailbox = self._mailboxes.get(result.processor)
         if mailbox is None:
             mailbox = Mailbox(1, self.notifier)
@@ -151,7 +151,7 @@ class ResultMailbox:
         return None
 
     def wait(self, timeout_s: float) -> Result | None:
-        """Take a result, waiting for one; None after ``timeout_s``, or once closed."""
+        """Wait for a result and take it; return None after ``timeout_s`` or once closed."""
         deadline = time.monotonic() + timeout_s
         while self.notifier.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
             result = None if self.closed else self.take()
@@ -176,20 +176,20 @@ class ResultMailbox:
 
     @property
     def dropped(self) -> int:
-        """Results that were replaced by newer ones or too old."""
+        """Number of results that were replaced by newer ones or were too old."""
         return self.expired + sum(mailbox.dropped for mailbox in self._mailboxes.values())
 
 
 def is_old(result: Result, max_age_s: float | None) -> bool:
-    """Return whether a result is now older than ``max_age_s``; False for None."""
+    """Return whether a result is now older than ``max_age_s``; always False if that is None."""
     return max_age_s is not None and result.age_s > max_age_s
 
 
 class ResultListener(Listener[Result]):
-    """A listener that skips results that are too old when their turn comes, and counts them in ``expired``."""
+    """A listener that skips results too old when their turn comes, counting them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
-        """Start calling the function; arguments as for :class:`Listener`, and ``max_age_s`` [s], None: no limit."""
+        """Start calling the function; arguments as for :class:`Listener`, and ``max_age_s`` [s], None for no limit."""
         self.expired = 0  #: results that were too old when their turn came
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
@@ -216,20 +216,20 @@ class ResultChannel(Channel[Result]):
         self.notifier = scheduler.notifier()  #: notified with each result
         self.counter = ChannelCounter()
         self._overtaken = 0
-        self._numbers: dict[int, int] = {}  # last number of each worker
+        self._numbers: dict[int, int] = {}  # number of the last result from each worker
         self._captured: dict[str, int] = {}  # capture time of the newest frame of each camera
 
     def restart(self) -> None:
-        """Forget the numbers of workers and frames, because a newly connected proxy starts new ones."""
+        """Forget the numbers of workers and frames, because a newly connected proxy starts new series."""
         self._numbers.clear()
         self._captured.clear()
 
     def stats(self, now_ns: int) -> ChannelStats:
-        """Return the statistics at ``now_ns``; overtaken results count as dropped."""
+        """Return the statistics at ``now_ns``; results that arrived after newer ones count as dropped."""
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:
-        """Publish a result unless it was overtaken; return False if it already arrived on the other topic."""
+        """Publish a result unless a newer one was published; return False if it already arrived on the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -305,7 +305,7 @@ class ResultChannels:
             self.everything.publish(result)
 
     def _make_room(self) -> None:
-        """Forget channels without consumers, oldest first, while there are too many: programs may invent names."""
+        """Forget channels without consumers, oldest first, if there are too many: programs may use invented names."""
         with self._lock:
             unused = [name for name, one in self._channels.items() if not one.subscribed]
             surplus = len(self._channels) + 1 - MAX_CHANNELS
@@ -319,7 +319,7 @@ def _captured_ns(mailbox: Mailbox[Result]) -> int:
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:
-    """Return the error message for missing results, with the number of those that were too old."""
+    """Return the error message for missing results, including the number of results that were too old."""
     if expired:
         return f"no sufficiently new result of {processor} arrived within {timeout_s:g} s; {expired} were too old"
     return (

@@ -33,7 +33,7 @@ from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
 RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
 
-#: A callback for the answer to a request, or the error; called once.
+#: A callback that is called once, with the answer to a request or with the error.
 Done = Callable[[AnyReply | LinkError], None]
 
 
@@ -48,7 +48,7 @@ class _Pending:
 
 
 class Requests:
-    """The unanswered requests of one connection. Requests are idempotent, and repeated until answered."""
+    """The unanswered requests of one connection. Requests are idempotent and are repeated until answered."""
 
     def __init__(self, send: Callable[[bytes], bool]) -> None:
         self._send = send
@@ -58,7 +58,7 @@ class Requests:
         self._failed: LinkError | None = None
 
     def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
-        """Send a request, repeat it after ``again_s``, and then every 0.3 s.
+        """Send a request, and repeat it after ``again_s`` and then every 0.3 s until it is answered.
 
         ``done`` is called once: on the receiving thread, on the thread that calls :meth:`tick` or :meth:`fail` or, if
         the connection has already failed, on this one. After ``timeout_s`` it gets a :class:`NoAnswerError`.
@@ -74,7 +74,7 @@ class Requests:
         if failed is not None:
             done(failed)
         else:
-            self._send(packet)  # tick() repeats it if it can't be handed over now
+            self._send(packet)  # if it can't be handed over now, tick() sends it again
 
     def answered(self, reply: Reply) -> bool:
         """Handle an answer; return False if the request is unknown or has timed out."""
@@ -101,7 +101,7 @@ class Requests:
             pending.done(NoAnswerError(f"the proxy did not answer {pending.what} within {pending.timeout_s:g} s"))
 
     def fail(self, error: LinkError) -> None:
-        """Answer all present and future requests with ``error``, because the connection is gone."""
+        """Answer all pending and future requests with ``error``, because the connection is gone."""
         with self._lock:
             self._failed = error
             pending, self._pending = list(self._pending.values()), {}
@@ -110,24 +110,24 @@ class Requests:
 
 
 PING_S: Final = 1.0  #: time limit for a ping
-FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
+FEEDBACK_STALL_S: Final = 1.0  #: time without feedback, although the proxy responds, after which to resubscribe
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock if it differs from ours
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval until there are a few round trips
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval while there have been only a few round trips
 _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
-    """Receives samples on the receiving thread, and changes of the connection on the supervisor's."""
+    """Receives samples on the receiving thread and changes of the connection on the supervisor's thread."""
 
     def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, but sent nothing else yet
     def disconnected(self) -> None: ...
     def link_changed(self, state: LinkState, reason: str) -> None: ...
-    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns when to call it again at the latest [ns]
+    def tick(self, now_ns: int) -> int: ...  #: does everything due; returns the latest time to call it again [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers of the other kinds
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers for all other kinds of samples
 
 
 class ProxySession:
@@ -144,24 +144,24 @@ class ProxySession:
         self._poke = poke
         self._clock = clock
         self.open = True  #: whether neither end has closed the session
-        self._quiet = False  # closed by this end, so later arrivals are ignored
+        self._quiet = False  # this end has closed the session, so later arrivals are ignored
         self._up = False
         self._pinged_ns = 0
         self._pinged = False  # a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # for each of the transport's topics, the topics that it serves
+        self._video_users: dict[str, set[str]] = {}  # the requested topics that each of the transport's topics serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # the form in which feedback arrives in this session
-        self._only_plain = False  # the proxy sends no other form
+        self._feedback = PLAIN  # the variant of feedback that arrives in this session
+        self._only_plain = False  # whether the proxy offers no other variant
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock minus ours
-        self.closed_reason: str | None = None  #: why it ended, once it has
+        self.closed_reason: str | None = None  #: why the session ended; None while it has not
         self.receiver = 0  #: identity of the receiving thread
         self.look_ns = 0  #: when the supervisor next evaluates its state
-        self._end = dial(self)  # last, because packets may arrive at once
+        self._end = dial(self)  # must be last, because packets may arrive at once
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
 
@@ -178,7 +178,7 @@ class ProxySession:
             self.offset_ns = self._trips.add(sent_ns, welcome.now_ns, self._clock()).ns
 
     def close(self, error: LinkError) -> None:
-        """End the session; unanswered requests get ``error``."""
+        """End the session and fail unanswered requests with ``error``."""
         self._quiet, self.open = True, False
         self._end.close()
         self.requests.fail(error)
@@ -197,7 +197,7 @@ class ProxySession:
 
     @property
     def transmit(self) -> Callable[[bytes], bool]:
-        """The transport's own send function, without another layer, for frequent packets."""
+        """The send function of the transport itself, without another layer, for frequent packets."""
         return self._end.send
 
     def send(self, packet: bytes) -> bool:
@@ -210,7 +210,7 @@ class ProxySession:
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is the one that receives at present."""
+        """Whether the calling thread is currently the one that receives."""
         return self.receiver == threading.get_ident() or self._end.receiving
 
     def subscribe(self, topic: str, on: bool) -> None:
@@ -231,9 +231,9 @@ class ProxySession:
         self._end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
-        """Repeat due requests, and ping the proxy if it is silent or its clock needs measuring."""
+        """Repeat due requests, and ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
-        late_ns = self.monitor.late_ns  # silence after which the proxy is pinged
+        late_ns = self.monitor.late_ns  # time without data after which the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
@@ -244,10 +244,10 @@ class ProxySession:
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
-        """Resubscribe to feedback if it has stalled although the proxy answers.
+        """Subscribe to feedback again if none is arriving although the proxy answers.
 
-        If feedback was requested in another form, plain feedback replaces it for the rest of this session: the proxy
-        may be older, or have no room for more forms. Consumers select their samples in any case.
+        If only part of the feedback was requested, plain feedback replaces it for the rest of this session, because the
+        proxy may be older or have no room for more variants. Consumers filter their samples anyway.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns
@@ -259,7 +259,7 @@ class ProxySession:
         self._end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
-        """Evaluate the link by the new feedback rate from now on."""
+        """From now on, evaluate the link by the new feedback rate."""
         if request == self._feedback:
             return
         now_ns, self._feedback = self._clock(), request
@@ -294,12 +294,12 @@ class ProxySession:
         if type(sample) is Feedback:
             if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
-                if not self._up:  # the first sample wakes the supervisor, which reports that the link is up
+                if not self._up:  # on the first sample, wake the supervisor, which reports that the link is up
                     self._up = True
                     self._poke()
             return
         handler = self._handlers.get(type(sample))
-        if handler is None:  # a kind that proxies do not send
+        if handler is None:  # proxies do not send this kind of sample
             self._malformed()
             return
         self.monitor.received_ns = now_ns
@@ -308,7 +308,7 @@ class ProxySession:
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         """Check a frame's size and pass it on; on the receiving thread.
 
-        ``topic`` is the request that it answers; empty: a plain frame of the camera.
+        ``topic`` is the request that the frame answers; empty for a plain frame of the camera.
         """
         now_ns = self._clock()
         if self._quiet:
@@ -343,7 +343,7 @@ def frame_size(header: FrameHeader) -> int:
 def _carrier(topic: str, *, variants: bool) -> str:
     """Return the transport's topic that carries this video.
 
-    ``variants``: whether the transport carries frames in the requested form. If not, all frames arrive unchanged, and
+    ``variants``: whether the transport carries frames in the format requested. If not, all frames arrive unchanged, and
     each channel filters and scales them itself.
     """
     request = VideoRequest.parse(topic)

@@ -52,7 +52,7 @@ OnError = Literal["continue", "raise", "stop", "land"]
 Target = str | Mapping[str, str]
 Missing = Literal["raise", "skip"]
 
-_WILD: Final = frozenset("*?[")  #: characters that turn a name into a pattern
+_WILD: Final = frozenset("*?[")  #: characters that make a name a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _ROUNDING_S: Final = 1e-6
 _log = logging.getLogger("skyloop")
@@ -106,9 +106,9 @@ def swarm(
 
 
 def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return the targets by name, in the order given. Pure. For targets and errors see :func:`swarm`.
+    """Return the targets by name, in the order given. Pure. See :func:`swarm` for targets and errors.
 
-    ``running`` returns the names of running proxies; it is called only if there is a pattern.
+    ``running`` returns the names of the running proxies; it is only called if a target is a pattern.
     """
     chosen: dict[str, str] = {}
     counts: dict[str, int] = {}
@@ -162,9 +162,9 @@ class Swarm:
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.
     - ``"land"``: the others land, then :class:`SwarmError` is raised.
 
-    A drone with a lost link gets no commands, and rejoins when the link is back; a command that could not be sent
-    is a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same
-    time (or hover, with ``on_exit``), including those set aside, even if some of them fail.
+    A drone whose link is lost receives no commands and rejoins when the link is restored; failing to send a command
+    counts as a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same time
+    (or hover, with ``on_exit``), including those set aside, even if some of them fail.
 
     Commands return a dict with the result of the same command of :class:`Drone` for each name. Methods that command,
     read or wait raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not
@@ -178,7 +178,7 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """Adopt connected drones, by name, which the swarm closes at its end; see :func:`skyloop.swarm`.
+        """Take over connected drones, by name, and close them at the end; see :func:`skyloop.swarm`.
 
         ``missing`` are the requested drones that could not be connected, with the reasons. Raises :class:`UsageError`
         if there is no drone, or ``on_error`` is unknown.
@@ -204,7 +204,7 @@ class Swarm:
     def active(self) -> dict[str, Drone]:
         """The drones that receive commands, by name.
 
-        Reading it readmits drones whose authority was given back.
+        Reading it readmits drones that have regained the authority.
         """
         for name, error in list(self._aside.items()):
             if isinstance(error, AuthorityError) and self._drones[name].authority.state == "held":
@@ -214,7 +214,7 @@ class Swarm:
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones do not take part, by name: those set aside and those that never connected."""
+        """The reasons why drones do not take part, by name: drones that were set aside or never connected."""
         return {**self.missing, **self._aside}
 
     def readmit(self, *names: str) -> None:
@@ -259,7 +259,7 @@ class Swarm:
         """Take off with all active drones at the same time; see :meth:`Drone.takeoff`.
 
         Args:
-            wait: Wait until each hovers.
+            wait: Wait until every drone hovers.
             timeout_s: How long to wait [s].
         """
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
@@ -327,8 +327,8 @@ class Swarm:
     ) -> None:
         """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
 
-        Nothing keeps the drones apart on the way: use :class:`skyloop.control.formation_flight.Formation` to plan safe
-        paths. Drones that are set aside are left out.
+        Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
+        paths. Drones that are set aside are skipped.
 
         Args:
             places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
@@ -367,7 +367,7 @@ class Swarm:
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
-            land: Land there, otherwise hover above it; None: each drone's ``return.land``.
+            land: Whether to land there instead of hovering above it; None: each drone's ``return.land``.
             wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
             timeout_s: How long to wait [s].
 
@@ -389,7 +389,7 @@ class Swarm:
         """Cut the motors of all drones at once, including those set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some, whatever ``on_error`` is.
+            SwarmError: If the command could not be sent to some drones, whatever the value of ``on_error``.
         """
         sent, errors = _try_all(self._drones, lambda drone: drone.emergency_stop())
         errors |= {name: _not_sent(self._drones[name]) for name, handed in sent.items() if not handed}
@@ -402,9 +402,9 @@ class Swarm:
         return self.send(dict.fromkeys(self.active, action))
 
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone with its name, all sent together.
+        """Make each action the newest set-point of the drone it is for, sending them all at once.
 
-        Drones that are set aside are left out. A hover doesn't take a drone from others, see :meth:`hover`.
+        Drones that are set aside are skipped. A hover doesn't take a drone from others (see :meth:`hover`).
         :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -425,14 +425,14 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        # Wait a few milliseconds at most until every drone can send a set-point at once, so that all are sent together.
+        # Wait at most a few milliseconds until every drone can send a set-point at once, so that all are sent together.
         open_ns = max((drone._commands.schedule.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
             action, commands = actions[name], ready[name]._commands
-            if type(action) is Hover:  # hovering the swarm must not take a drone from its safety pilot
+            if type(action) is Hover:  # a hover of the whole swarm must not take a drone from its safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
@@ -453,11 +453,11 @@ class Swarm:
         """Call ``function`` with each active drone in a separate thread, and wait for all.
 
         Args:
-            function: If it raises a :class:`SkyloopError`, its drone has failed; any other exception is re-raised here.
+            function: A drone for which it raises :class:`SkyloopError` fails; other exceptions are re-raised.
             what: Name of the action in error messages; empty: the function's name.
 
         Returns:
-            Its results by name.
+            The results of the calls, by name of the drone.
         """
         self._check_open()
 
@@ -479,7 +479,7 @@ class Swarm:
     ) -> dict[str, AuthorityStatus]:
         """Request the authority over all active drones; return the status of each, by name.
 
-        Arguments are those of :meth:`Drone.request_authority`.
+        The arguments are those of :meth:`Drone.request_authority`.
         """
         return self.each(
             lambda drone: drone.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay),
@@ -506,10 +506,10 @@ class Swarm:
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that don't meet it have failed.
 
         Args:
-            wanted: A flight state or its name, several of them, or a predicate on feedback.
+            wanted: A flight state or its name, several of these, or a predicate on feedback.
             timeout_s: How long to wait [s].
 
         Returns:
@@ -538,18 +538,18 @@ class Swarm:
         return {name: feedback for name, feedback in met.items() if name not in errors}
 
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
-        """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
+        """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration longer than a period, the deadlines restart from there. When the loop
-        ends, by its time, a ``break``, an exception or Ctrl-C, drones still flying its velocities or attitudes hover at
-        once, because no newer ones would follow.
+        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts from its end.
+        When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or
+        attitudes that it sent hover at once, because no newer ones would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
             seconds: Duration [s]; None: until the loop ends.
 
         Raises:
-            UsageError: If ``rate_hz`` is out of range, at the first iteration.
+            UsageError: If ``rate_hz`` is out of range; raised by the first iteration.
         """
         if not 0.1 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 0.1 to 200 ticks a second")
@@ -563,14 +563,14 @@ class Swarm:
                 yield Tick(count, due_s - begun_s, late_s)
                 count += 1
                 due_s = max(due_s + period_s, time.monotonic())
-        finally:  # a break or an exception in the loop drops this generator, which runs this at once
+        finally:  # if the loop ends by a break or an exception, this generator is dropped, and this runs at once
             for drone in self:
                 if isinstance(drone._commands.newest, Velocity | Attitude):
                     drone._piloting.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of a :meth:`send` [s]; None before the first."""
+        """Time between the first and the last command of each :meth:`send` [s]; None before the first call."""
         return distribution(np.frombuffer(bytes(self._spreads_ns), np.int64))
 
     # Failures ------------------------------------------------------------------------------------------------------
@@ -578,7 +578,7 @@ class Swarm:
     def fail(self, what: str, errors: Mapping[str, Exception]) -> None:
         """Apply ``on_error`` after some drones have failed. Does nothing if ``errors`` is empty.
 
-        The swarm's own commands call it; programs that build on a swarm may call it, too.
+        The swarm's own commands call this method; programs that build on a swarm may call it, too.
 
         Args:
             what: Name of the failed action, for the error.
@@ -616,7 +616,7 @@ class Swarm:
         self._closed = True
         for drone in self._drones.values():
             if not drone.closed:
-                drone._commands.bar()  # for all drones, before the first lands
+                drone._commands.bar()  # on all drones before the first one lands
         return end_flights(self._drones)
 
     def close(self) -> None:
@@ -651,7 +651,7 @@ class Swarm:
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
     """Call ``function`` for each item in turn; return its results and its :class:`SkyloopError`, by name.
 
-    Any other exception is raised after the function has been called for every item.
+    Any other exception is raised only after the function has been called for every item.
     """
     results: dict[str, R] = {}
     raised: dict[str, Exception] = {}
@@ -664,7 +664,7 @@ def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[s
 
 
 def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
-    """Return the exceptions if all are Skyloop's own; raise the first that is not."""
+    """Return the exceptions if all of them are Skyloop's own; otherwise raise the first that is not."""
     errors: dict[str, Exception] = {}
     for name, error in raised.items():
         if not isinstance(error, SkyloopError):
@@ -704,19 +704,19 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
     """End all drones' flights at the same time and close them; return the errors by name.
 
-    Ctrl-C ends the wait for landings: each landing is still commanded, and continues without this program.
+    Ctrl-C ends the wait for the landings, but each drone is still told to land, and lands without this program.
     """
     return _problems(drones, lambda drone: drone._piloting.end_flight())
 
 
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
-    """Land all drones, or end their flights, at the same time; return the errors by name."""
+    """Land all drones, or end all flights, at the same time; return the errors by name."""
 
     def job(drone: Drone) -> Callable[[], SkyloopError | None]:
         def ended() -> SkyloopError | None:
             try:
                 return end(drone)
-            except GivenUpError:  # no caller is waiting for it any more
+            except GivenUpError:  # no caller is waiting for the result any more
                 return None
 
         return ended
@@ -734,15 +734,15 @@ def _not_sent(drone: Drone) -> LinkError:
 def in_parallel(
     jobs: Mapping[str, Callable[[], T]], interrupted: threading.Event | None = None
 ) -> tuple[dict[str, T], dict[str, Exception]]:
-    """Run all jobs, by name, at the same time, each in its own thread, and wait for the last.
+    """Run all jobs, by name, at the same time, each in its own thread, and wait until all have ended.
 
-    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or
-    ``interrupted`` once set, ends the jobs' waits for commands, see :data:`skyloop.client.commands.cancelled`; their
-    other work ends normally.
+    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or setting
+    ``interrupted``, ends the jobs' waits for commands (see :data:`skyloop.client.commands.cancelled`); their other work
+    ends normally.
 
     Returns:
         The result of each job, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
-        re-raised here when all have ended.
+        re-raised here after all jobs have ended.
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
@@ -769,7 +769,7 @@ def in_parallel(
         for name in left:
             copy_context().run(work, name, jobs[name])
             if not isinstance(raised.get(name), Exception | None):
-                raise raised[name]  # Ctrl-C, on this thread: start nothing else
+                raise raised[name]  # Ctrl-C on this thread: don't start any more jobs
         for thread in threads:
             thread.join()
     except BaseException:  # Ctrl-C: a take-off must not be executed later

@@ -41,7 +41,7 @@ from skyloop.messages.subscription import PLAIN, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-#: A condition to wait for: a flight state or its name, several of which any will do, or a predicate on feedback.
+#: A condition to wait for: a flight state or its name, several (any of them will do), or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
 
@@ -53,7 +53,7 @@ class LinkStatus:
     application: LinkState  #: hop from application to proxy
     vehicle: LinkState  #: hop from proxy to vehicle, as last reported by the proxy
     reason: str = ""
-    remedy: str = ""  #: what to do about the vehicle's link while it is not up
+    remedy: str = ""  #: what the user can do about the vehicle's link while it is not up
 
 
 class Mailboxes:
@@ -75,7 +75,7 @@ class Mailboxes:
     ) -> None:
         """Create empty mailboxes as requested; see :class:`skyloop.extend.InboxOptions`.
 
-        Raises the errors of :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
+        Raises the same errors as :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
         """
         known = state.results
         named = [known.everything] if processors is None else [known.channel(one) for one in processors]
@@ -108,7 +108,7 @@ class Mailboxes:
         return self.feedback.waiting or self.frames.waiting or self.results.waiting
 
     def frame(self) -> Frame | None:
-        """Take the newest frame; None if it was already taken, none arrived, or it can't be decoded."""
+        """Return the newest frame and empty the mailbox; None if no new frame arrived or it can't be decoded."""
         arrival, video = self.frames.take(), self._video
         if arrival is None or video is None:
             return None
@@ -116,14 +116,14 @@ class Mailboxes:
 
 
 class FeedbackDemand:
-    """Subscribes to the form of feedback that satisfies all consumers of a drone.
+    """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
-    A pilot gets every sample, complete, because they show its link, its authority and failsafes. So does an observer
-    until a consumer limits its request, and whenever a consumer needs them all. A connection has one form at a time.
+    A pilot gets every sample in full, because samples show its link, its authority and failsafes. So does an observer
+    until a consumer limits its request, or whenever a consumer needs them all. A connection uses one variant at a time.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription never changes."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes after that."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
@@ -151,7 +151,7 @@ class FeedbackDemand:
 
     @contextmanager
     def wanted(self, request: FeedbackRequest) -> Iterator[None]:
-        """Add a request during the block."""
+        """Keep a request in effect during the block."""
         self.want(request, True)
         try:
             yield
@@ -165,7 +165,7 @@ class FeedbackDemand:
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # before unsubscribing, so that no sample is missed
+            self._connection.subscribe(needed.topic, True)  # subscribe first, so that no sample is missed
             self._connection.subscribe(before.topic, False)
 
 
@@ -193,12 +193,12 @@ class ClientState:
         self.app = app
         self.scheduler = scheduler
         self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
-        self.to_close: list[Callable[[], None]] = []  #: end resources that end with the drone
+        self.to_close: list[Callable[[], None]] = []  #: functions that release resources when the drone is closed
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
-        self.received_ns = 0  #: when the newest feedback arrived, on our clock
+        self.received_ns = 0  #: when the newest feedback arrived, on this process's clock
         self.history = FeedbackHistory()
-        #: Notified with each feedback, and with every change that a thread may wait for.
+        #: Notified on each feedback sample, and on every change that a thread may be waiting for.
         self.notifier = scheduler.notifier()
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
@@ -216,11 +216,11 @@ class ClientState:
         self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
         self.overview: Overview | None = None  #: the newest complete overview
         self.on_share: Channel[ProcessorShare] = Channel()
-        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; published on the supervisor's thread
+        self.on_welcome: Channel[Welcome] = Channel()  #: publishes each new connection, on the supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
-        self._making = threading.RLock()  # so that two threads that request the same channel get the same one
+        self._making = threading.RLock()  # so that two threads requesting the same channel get the same object
 
     @property
     def name(self) -> str:
@@ -232,7 +232,7 @@ class ClientState:
         return self.scheduler.sample_notifier(self._connection)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
-        """Return the channel found by ``find``, even after the proxy restarts with other cameras."""
+        """Return the channel that ``find`` returns, and follow it when the proxy restarts with other cameras."""
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
@@ -250,7 +250,7 @@ class ClientState:
             self.listeners.remove(listener)
 
     def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
-        """Return the error for a missing frame, with the known reason."""
+        """Return the error for a missing frame, with the reason if it is known."""
         link = self.status
         words = [f"no frame of {camera} arrived within {timeout_s:g} s"]
         if link.vehicle is not LinkState.UP:
@@ -258,7 +258,7 @@ class ClientState:
         return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
-        """Return the channel of feedback as requested, creating it on the first call."""
+        """Return the channel that delivers feedback as requested, creating it on the first call."""
         if request.is_plain:
             return self.on_feedback
         with self._making:
@@ -277,7 +277,7 @@ class ClientState:
         self.notifier.notify()
 
     def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
-        """Return the statistics of every channel by its name; ``sends`` counts the commands sent."""
+        """Return the statistics of every channel, by name; ``sends`` counts the commands that were sent."""
         now_ns = self._clock()
         echoes = self.echoes.stats(now_ns)
         found = {
@@ -313,7 +313,7 @@ class ClientState:
 class SessionSamples:
     """Handles the samples and changes of the connection in every session.
 
-    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, the rest on the supervisor's.
+    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, all else on the supervisor's.
     """
 
     def __init__(
@@ -349,7 +349,7 @@ class SessionSamples:
         state.on_welcome.publish(welcome)
 
     def link_changed(self, state: LinkState, reason: str) -> None:
-        """Publish the state of the hop to the proxy, and an event."""
+        """Publish the state of the hop to the proxy, along with an event."""
         severity = Severity.INFO if state in (LinkState.UP, LinkState.CLOSED) else Severity.WARNING
         text = f"link to the proxy: {state.value}" + (f" ({reason})" if reason else "")
         self._state.set_status(replace(self._state.status, application=state, reason=reason))
@@ -361,17 +361,17 @@ class SessionSamples:
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
-        """Store and publish a sample of feedback, then update the statistics, the authority and the link's state."""
+        """Store and publish a feedback sample, then update the statistics, the authority and the link's state."""
         state = self._state
         before = state.newest
         state.history.add(sample)
         state.newest = sample
         state.received_ns = now_ns
-        # A failsafe or another owner ends the set-point, but not a command that a listener sends on this sample.
+        # A failsafe or another owner clears the set-point, but no command that a listener sends because of this sample.
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)
-        state.on_feedback.publish(sample)  # consumers first, then the statistics
+        state.on_feedback.publish(sample)  # serve the consumers before the statistics
         for channel in state.selected:
             channel.receive(sample)
         state.notifier.notify()
@@ -399,7 +399,7 @@ class SessionSamples:
         self._state.notifier.notify()
 
     def _applied(self, applied: Applied, now_ns: int) -> None:
-        """Publish the echo of a command, and measure the delay of this application's own."""
+        """Publish the echo of a command; if the command is this application's own, measure its delay."""
         if applied.app_id == self._commands.app_id:
             self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
         self._state.on_command.publish(applied)
@@ -414,7 +414,7 @@ class SessionSamples:
 
 
 def _link_reason(events: Sequence[Event]) -> str:
-    """Return the reason in the newest event about the vehicle's link; empty if there is none."""
+    """Return the reason given in the newest event about the vehicle's link; empty if there has been no such event."""
     found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
     return next((str(event.data.get("reason", "")) or event.text for event in found), "")
 
@@ -424,7 +424,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition and its readable name; :class:`UnknownNameError` for an unknown state."""
+    """Return the predicate for a condition, and its readable name. Raises :class:`UnknownNameError`."""
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")
         return wanted, "as wanted" if name == "<lambda>" else name

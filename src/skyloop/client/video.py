@@ -26,10 +26,10 @@ from skyloop.transport.base import Pixels, stream, video
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-#: Maximum number of pictures that wait for decoding; if decoding is slower, they are skipped up to a key picture.
+#: Maximum number of frames waiting to be decoded; if decoding is slower, skip to the next key frame.
 MOST_WAITING: Final = 6
-IDLE_KEPT: Final = 32  #: maximum number of channels kept of each kind; beyond it, unread ones are forgotten
-ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key picture before requesting it again
+IDLE_KEPT: Final = 32  #: maximum number of channels of each kind to keep; if there are more, unread ones are forgotten
+ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key frame before requesting it again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
 
@@ -52,12 +52,12 @@ def usual(camera: str) -> VideoRequest:
 
 
 class StreamOptions(TypedDict, total=False):
-    """Options for H.264; without options, pictures arrive as the vehicle itself encoded them."""
+    """Options for H.264; without options, frames arrive as encoded by the vehicle itself."""
 
     kbit_s: int | None  #: rate at which the proxy encodes, once for all clients with the same request [kbit/s]
-    max_fps: float | None  #: maximum pictures per second; None: all
+    max_fps: float | None  #: maximum number of frames per second; None: all
     scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: the only subscriber that the proxy encodes for, at the rate that its path can carry
+    subscriber: str  #: the only subscriber, to whose path the proxy adapts the rate
 
 
 class VideoChannel(Channel[Arrival]):
@@ -71,20 +71,20 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Create a channel, without consumers, for a request for a camera's frames; None: see :func:`usual`."""
+        """Create a channel, without consumers, for a request for a camera's frames, by default :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
-        #: Name in the statistics: the camera's plain topic for the default request, otherwise the request's own.
+        #: Name in the statistics: the camera's plain topic for the default request, otherwise the topic of the request.
         self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
         self.newest: Arrival | None = None
-        self.notifier = scheduler.notifier()  #: notified with each frame
+        self.notifier = scheduler.notifier()  #: notified of each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
         self.too_old = 0  #: number of frames rejected because of a consumer's ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         chosen = self.request.part is not None or self.request.max_fps is not None
-        #: Selects this request's frames from the plain ones; None: all of them.
+        #: Selects the frames for this request from the full stream; None if it includes all of them.
         self.filter = FrameFilter(self.request) if chosen else None
         self._read: Arrival | None = None  # the last result of next_frame()
         self._connection = connection
@@ -113,17 +113,17 @@ class VideoChannel(Channel[Arrival]):
             return None
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame received at ``now_ns``; ignore duplicates and overtaken ones.
+        """Publish a frame received at ``now_ns``, ignoring duplicates and frames that arrive after a newer one.
 
-        ``as_asked``: whether the proxy prepared it for this request; if False, it is scaled here as needed.
+        ``as_asked``: whether the proxy prepared the frame for this request; if not, it is scaled here as needed.
         """
         counter = self.counter
         last = counter.last_seq
         if last is not None and header.seq <= last:
-            return  # a duplicate, or overtaken
+            return  # a duplicate, or older than the newest frame
         offset_ns, scale = self._connection.offset_ns, 1.0 if as_asked else self.request.scale
         arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Consumers come first, then the statistics. The previous frame is released last, because returning its memory
+        # Serve the consumers before the statistics. The previous frame is released last, because returning its memory
         # to the proxy takes longer than everything else here.
         before, self.newest = self.newest, arrival
         self.publish(arrival)
@@ -143,7 +143,7 @@ class VideoChannel(Channel[Arrival]):
         return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
 
     def _period_s(self, fps: float) -> float:
-        """Expected time between two frames of this request [s]; 0 if unknown."""
+        """Return the expected time between two frames of this request [s]; 0 if unknown."""
         most = self.request.max_fps
         rate = min(fps, most) if fps > 0.0 and most is not None else fps or most or 0.0
         parts = 1 if self.request.part is None else self.request.part[1]
@@ -151,20 +151,20 @@ class VideoChannel(Channel[Arrival]):
 
 
 class StreamChannel(Channel[EncodedFrame]):
-    """Delivers the whole pictures of one stream in order of arrival; some may be missing."""
+    """Delivers the complete frames of one stream in order of arrival; some may be missing."""
 
     def __init__(self, topic: str, connection: ProxyConnection, clock: Clock) -> None:
         super().__init__(lambda on: connection.subscribe(topic, on))
         self.topic = topic
-        self.decoder: StreamDecoder | None = None  #: for consumers of decoded frames
+        self.decoder: StreamDecoder | None = None  #: decodes frames for consumers that need images
         self._connection = connection
         self._clock = clock
-        self._encoded_here = "?" in topic  # whether the proxy encodes it, and so needs reports of arrivals
+        self._encoded_here = "?" in topic  # whether the proxy encodes the stream, so it needs reports of arrivals
         self._pieces = Pieces()
         self._asked_ns = -ASK_AGAIN_NS
 
     def receive(self, part: EncodedFrame) -> None:
-        """Handle a received part, on the receiving thread."""
+        """Handle a received part of a frame, on the receiving thread."""
         picture = self._pieces.add(part)
         if picture is None:
             return
@@ -173,9 +173,9 @@ class StreamChannel(Channel[EncodedFrame]):
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Report the newest picture to the proxy, which adapts its rate to the path by these reports. Thread-safe.
+        """Report the newest frame to the proxy, which uses these reports to adapt its rate to the path. Thread-safe.
 
-        ``wants_key``: pictures can't be decoded because one is missing; requests are limited to a few a second.
+        ``wants_key``: a missing frame prevents decoding; such requests are limited to a few a second.
         """
         if not self._encoded_here:
             return
@@ -188,15 +188,15 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream in its own thread, in order. If a picture can't be decoded, skips to a key picture.
+    """Decodes one stream in its own thread, in order. After an undecodable frame, skips to the next key frame.
 
-    ``deliver`` is called on that thread with each picture: its header, its pixels in BGR, and its arrival time [ns].
+    ``deliver`` is called on that thread with each image: its header, its pixels in BGR, and its arrival time [ns].
     """
 
     def __init__(
         self, stream: StreamChannel, deliver: Callable[[FrameHeader, Pixels, int], None], clock: Clock, name: str
     ) -> None:
-        self.dropped = 0  #: received pictures not shown, because of a gap, damage, or too many at once
+        self.dropped = 0  #: received frames that were not shown because of a gap, damage, or too many at once
         self._stream = stream
         self._deliver = deliver
         self._clock = clock
@@ -208,10 +208,10 @@ class StreamDecoder:
         self._context: VideoCodecContext | None = None
 
     def put(self, picture: EncodedFrame) -> None:
-        """Queue a picture, on the receiving thread."""
+        """Queue an encoded frame, on the receiving thread."""
         with self._changed:
             follows = picture.codec == H264 and self._chain.follows(picture.seq, key=picture.key)
-            if picture.key:  # earlier pictures are no longer useful
+            if picture.key:  # earlier frames are no longer needed
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
             elif follows and len(self._waiting) >= MOST_WAITING:
@@ -245,11 +245,11 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False  # pictures that follow a silence still continue the stream, so the decoder stays
+            self._running = False  # frames after a pause still continue the stream, so keep the decoder
             return None
 
     def _leave_out(self) -> None:
-        """Skip a damaged picture and those that refer to it."""
+        """Skip a damaged frame and all frames that refer to it."""
         with self._changed:
             self.dropped += 1
             while self._waiting and not self._waiting[0][0].key:
@@ -281,9 +281,9 @@ class VideoChannels:
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
         self.channels: dict[str, VideoChannel] = {}  #: channels for the default request, by camera
-        self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
+        self.variants: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
-        self.subscriber = secrets.token_hex(8)  #: identifies streams whose rate is adapted to this client's path
+        self.subscriber = secrets.token_hex(8)  #: identifies the streams whose rate is adapted to this client's path
         self._connection = connection
         self._scheduler = scheduler
         self._history = history
@@ -303,7 +303,7 @@ class VideoChannels:
     ) -> VideoChannel:
         """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
-        ``max_age_s`` is only checked here: the consumer passes it to :meth:`VideoChannel.picture`. Raises also
+        ``max_age_s`` is only validated here: the consumer passes it to :meth:`VideoChannel.picture`. Also raises
         :class:`MissingExtraError` if H.264 is requested and PyAV is not installed.
         """
         self._connection.check_open()
@@ -365,11 +365,11 @@ class VideoChannels:
         """Store the cameras of a newly connected proxy, which may count its frames from 0."""
         for channel in tuple(self.variants.values()):
             channel.restart(now_ns)
-        # The proxy may have restarted with other cameras, and another one may be the first.
+        # The proxy may have restarted with other cameras, and a different one may be the first.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
-        """Resubscribe to cameras that have stalled while other samples arrive (``flows``)."""
+        """Resubscribe to cameras that have stalled while other samples are arriving (``flows``)."""
         for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
@@ -377,7 +377,7 @@ class VideoChannels:
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
         """Deliver a frame to its channels.
 
-        ``topic`` is the request that it answers; empty: a plain frame of the camera, for all its channels.
+        ``topic`` is the request that the frame answers; empty: a plain frame of the camera, for all its channels.
         """
         if topic:
             channel = self.variants.get(topic)
@@ -390,7 +390,7 @@ class VideoChannels:
                 channel.receive(header, pixels, now_ns, as_asked=False)
 
     def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
-        """Deliver a picture of an encoded stream."""
+        """Deliver a frame of an encoded stream."""
         channel = self.streams.get(picture.topic or stream(picture.camera))
         if channel is not None:
             channel.receive(picture)

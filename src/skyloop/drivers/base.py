@@ -44,7 +44,7 @@ from skyloop.messages.parameter import Diagnostic
 class Sink(Protocol):
     """Receives a driver's feedback, frames, link states and events.
 
-    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is a time of
+    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is on the clock of
     ``time.monotonic_ns`` on this host.
     """
 
@@ -67,7 +67,7 @@ class Sink(Protocol):
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a whole frame.
+        """Publish a complete frame.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
@@ -81,10 +81,10 @@ class Sink(Protocol):
         """
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera's frames are used at present. If not, a driver need not decode them."""
+        """Return whether this camera's frames are currently used. If not, a driver need not decode them."""
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames per second the most demanding consumer uses at present.
+        """Return the highest rate, in frames per second, at which any consumer currently uses this camera's frames.
 
         0 means none, infinity means all. If frames are expensive, a driver may skip those beyond this rate.
         """
@@ -100,25 +100,25 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a picture as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a frame as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        Size, time and intrinsics are those of the decoded frame. While frames are in use, the decoded frame is also
-        passed to :meth:`frame`.
+        Size, time and intrinsics are the same as those of the decoded frame. While frames are in use, the decoded frame
+        is also passed to :meth:`frame`.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
-            data: One undamaged H.264 access unit in Annex B format, from a stream without B pictures. Key pictures
-                include SPS and PPS. Any other picture must continue the previous one passed here: after a gap, or a
-                period without receivers, start with a key picture.
-            captured_ns: When the picture was captured, on this host's monotonic clock.
+            data: One undamaged H.264 access unit in Annex B format, from a stream without B-frames. Key frames
+                include SPS and PPS. Any other frame must continue the one passed before it: after a gap, or after a
+                period without receivers, start with a key frame.
+            captured_ns: When the frame was captured, on this host's monotonic clock.
             width: Width [px].
             height: Height [px].
-            key: Whether decoding can start with this picture.
+            key: Whether decoding can start with this frame.
             intrinsics: Intrinsics for this size; None if unknown.
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded pictures have receivers at present."""
+        """Return whether anyone is currently receiving this camera's encoded frames."""
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
         """Report a new state of the vehicle link, or a new reason for the current one.
@@ -126,7 +126,7 @@ class Sink(Protocol):
         Args:
             state: UP once the vehicle answers.
             reason: What is being waited for, and the last failure. Shown to every client.
-            remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
+            remedy: What the user can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
         """
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
@@ -147,13 +147,13 @@ class ServedLink(Protocol):
         """Return a descriptor that becomes readable when :meth:`serve` must be called."""
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work without waiting. Errors raised are already reported; the host retries after a pause.
+        """Do all pending work without waiting. Errors raised have already been reported; the host retries later.
 
         Args:
-            readable: Whether :meth:`fileno` is readable; if not, the time last returned has come.
+            readable: Whether :meth:`fileno` is readable; if not, the deadline returned last has passed.
 
         Returns:
-            Latest time of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
+            Deadline of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
         """
 
     def end(self) -> None:
@@ -181,19 +181,19 @@ class ExternalPose:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
     def bounded(self, now_ns: int) -> ExternalPose:
-        """Return the pose with its time limited to the present, as drivers require.
+        """Return the pose with its timestamp limited to the present, as drivers require.
 
         Raises :class:`DriverError` if it is more than 50 ms ahead: the clock is wrong, and all later poses would look
         old.
         """
         ahead_ns = self.captured_ns - now_ns
         if ahead_ns > AHEAD_NS:
-            raise DriverError(f"a pose is stamped {seconds(ahead_ns):.2g} s ahead of this host's clock, at most 0.05 s")
+            raise DriverError(f"the pose is stamped {seconds(ahead_ns):.2g} s ahead of our clock, more than 0.05 s")
         return self if ahead_ns <= 0 else replace(self, captured_ns=now_ns)
 
 
 class Driver(ABC):
-    """Base class of drivers. It owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
+    """Base class for drivers. Owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
 
     No I/O happens before :meth:`open`. Times passed to the sink are from ``time.monotonic_ns`` on this host.
     ``_open(sink)`` starts threads and does not wait, ``_close()`` joins them and clears all set-points, and
@@ -203,13 +203,13 @@ class Driver(ABC):
         uri: The vehicle's address with its options.
 
     Attributes:
-        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is theirs and left alone.
+        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is considered theirs.
         parameters_without_authority: Names of parameters that any pilot may write, because they don't affect a flight.
         serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
             its own thread.
 
     Raises:
-        UsageError: Raised by a subclass for an unknown option; see :func:`reject_unknown_options`.
+        UsageError: If a subclass does not know an option; see :func:`reject_unknown_options`.
     """
 
     shared = True
@@ -219,7 +219,7 @@ class Driver(ABC):
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. Subclasses read their options here, without I/O."""
         self.uri = uri
-        self.__lock = threading.Lock()  # private to this class, because subclasses may have their own _lock
+        self.__lock = threading.Lock()  # name-mangled, because subclasses may have a _lock of their own
         self._sink: Sink | None = None
 
     # Abilities ------------------------------------------------------------------------------------------------
@@ -228,18 +228,18 @@ class Driver(ABC):
     def capabilities(self) -> Capabilities:
         """Return the vehicle's capabilities.
 
-        May be called before :meth:`open`. The proxy emulates missing actions in software where it can.
+        May be called before :meth:`open`. The proxy emulates missing actions in software where possible.
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return those of the vehicle's own parameters that are known so far, with their present values.
+        """Return the vehicle's own parameters, as far as they are known yet, with their current values.
 
         Names are dotted and lower-case. May be called before the vehicle has answered.
         """
         return []
 
     def set_parameter(self, name: str, value: Value) -> Value:  # noqa: ARG002
-        """Write one parameter and return the value then in force.
+        """Write one parameter and return its new value.
 
         Called on the proxy's request thread; may take up to a second.
 
@@ -251,7 +251,7 @@ class Driver(ABC):
             The value in force, which the vehicle may have rounded.
 
         Raises:
-            ParameterError: The vehicle refuses the value; the message gives its reason.
+            ParameterError: If the vehicle refuses the value; the message gives its reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
@@ -266,8 +266,8 @@ class Driver(ABC):
             sink: Receives everything that the vehicle reports, until :meth:`close` returns.
 
         Raises:
-            UsageError: The driver is already open, or another error occurred that a retry can't fix.
-            MissingExtraError: A package that the driver needs is not installed.
+            UsageError: If the driver is already open, or another error occurred that a retry can't fix.
+            MissingExtraError: If a package that the driver needs is not installed.
         """
         with self.__lock:
             if self._sink is not None:
@@ -282,7 +282,7 @@ class Driver(ABC):
     def close(self) -> None:
         """Stop threads and release resources. Idempotent.
 
-        Does not land the vehicle: the proxy does so beforehand. The sink is not called after this returns.
+        Does not land the vehicle, because the proxy has already done so. The sink is not called after this returns.
         """
         with self.__lock:
             was_open, self._sink = self._sink is not None, None
@@ -298,8 +298,8 @@ class Driver(ABC):
         :meth:`capabilities`, and with finite numbers.
 
         Args:
-            action: A set-point or a one-time action. Without telemetry, a take-off is refused rather than kept for
-                later.
+            action: A set-point or a one-time action. If there is no telemetry, a take-off is refused rather than
+                postponed.
             new: Whether it is a new request from an application. If not, the library repeats or continues an earlier
                 request, which must not take the vehicle back from another controller.
 
@@ -307,12 +307,12 @@ class Driver(ABC):
             The action as limited by the vehicle.
 
         Raises:
-            DriverError: The vehicle can't execute it; the message is shown to people.
+            DriverError: If the vehicle can't execute it; the message is shown to users.
         """
         return self._apply(action) if new else self._repeat(action)
 
     def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
-        """Refuse a request to the software autopilot that the vehicle would certainly not follow.
+        """Refuse a request to the software autopilot that the vehicle would certainly not obey.
 
         Called before the software autopilot starts an action that the vehicle does not support itself. For example, a
         vehicle that can't be armed refuses the take-off. Returns at once.
@@ -321,17 +321,17 @@ class Driver(ABC):
             action: Take-off, hover, land, velocity or position.
 
         Raises:
-            DriverError: The vehicle would not follow it; the message is shown to people.
+            DriverError: If the vehicle would not obey it; the message is shown to users.
         """
 
     def left_to(self) -> str:
         """Return what others have made the vehicle do since our last command, such as ``RTL``.
 
-        Override this if the vehicle reports it. The proxy calls it several times a second, and leaves a vehicle flown
-        by others alone until a new action takes it over. Thread-safe; returns at once.
+        Override this if the vehicle reports such changes. The proxy calls it several times a second. A vehicle flown
+        by others is left alone until a new action takes it over. Thread-safe; returns at once.
 
         Returns:
-            The driver's word for it; empty if others have done nothing.
+            The driver's name for it; empty if others have done nothing.
         """
         return ""
 
@@ -366,8 +366,8 @@ class Driver(ABC):
             pose: Position and orientation in world axes.
 
         Raises:
-            UnsupportedError: The vehicle does not accept external poses.
-            DriverError: The pose can't be sent at present.
+            UnsupportedError: If the vehicle does not accept external poses.
+            DriverError: If the pose can't be sent at present.
         """
         raise UnsupportedError(f"{self.uri.scheme}:// does not accept external poses")
 
@@ -395,7 +395,7 @@ class Driver(ABC):
         return self._apply(action)
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it differs from a pilot's request."""
+        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it must differ from a pilot's request."""
         return self._apply(action)
 
 
@@ -410,7 +410,7 @@ def checked_value(parameter: Parameter, value: Value) -> Value:
     """Check a new value for a scalar parameter; return it, converted to float if the parameter is a float.
 
     Raises:
-        ParameterError: The value is of the wrong type, out of range, or not one of the choices.
+        ParameterError: If the value is of the wrong type, out of range, or not one of the choices.
     """
     name, kind = parameter.name, parameter.type
     if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:

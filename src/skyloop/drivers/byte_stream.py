@@ -20,19 +20,19 @@ from skyloop.files import wait_readable
 CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: a connection whose buffer stays full for this long is considered dead
 _READ_BYTES: Final = 65_536  # maximum number of bytes per read
-_BITS_PER_BYTE: Final = 10  # bits on a serial line for each byte, with start and stop bits
+_BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including the start and stop bits
 _DRAIN_S: Final = 0.1  # time limit for closing a connection before a new one is opened
 END_S: Final = 0.5  #: the same for the final close, because TCP resends a lost packet after 0.2 s
-_UNACKNOWLEDGED_MS: Final = 2500  # then a TCP connection is closed, so that nothing older is delivered
-_OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes still wait this long after their due time
+_UNACKNOWLEDGED_MS: Final = 2500  # age of unacknowledged data at which TCP is closed, to discard them
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line has stalled if bytes are still unsent this long after their due time
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
-#: Size of the longest frame in MAVLink and MSP [bytes]. Flight controllers' parsers read as many bytes as a frame
-#: announces and don't look for another frame among them, so a frame that may be incomplete is padded before a stop.
+#: Size of the longest frame in MAVLink and MSP [bytes]. A flight controller's parser consumes as many bytes as a frame
+#: announces without looking for another frame in them, so a possibly incomplete frame is padded before a stop is sent.
 _LONGEST: Final = 280
 
 
 class Rank(IntEnum):
-    """Priority of a packet: the first rank is always sent at once, the last only if the line is idle."""
+    """Priority of a packet. The first rank is always sent at once, the last only when the line is idle."""
 
     STOP = 0  #: emergency stops, which empty the output buffer of a serial port
     COMMAND = 1  #: modes and arming, which are rare, small and never held back
@@ -41,36 +41,36 @@ class Rank(IntEnum):
     POSE = 4  #: external poses, which are frequent and large
 
 
-#: Maximum lag of the line at which packets of a rank are still sent [ns].
+#: Maximum backlog of the line at which packets of a rank are still sent [ns].
 _PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(0.06), Rank.POSE: nanoseconds(0.02)}
 
 
 class LinePace:
-    """Estimates how far a line lags behind, so that packets are fresh on arrival. Pure.
+    """Estimates the backlog of a line, so that packets can be held back rather than arrive late. Pure.
 
     Args:
-        bytes_per_s: Speed of the line; None if it is never a bottleneck.
+        bytes_per_s: Speed of the line; None if the line is never a bottleneck.
         overdue_ns: How late written bytes may be before the line counts as stalled.
     """
 
     def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
-        self._free_ns = 0  # time by which all bytes written will have been sent
-        self._written = 0  # total number of bytes written
-        self._mark = 0  # how many of these are due at _due_ns
-        self._due_ns: int | None = None  # time by which they should have been sent; None if none were waiting
+        self._free_ns = 0  # when all bytes written so far will have been sent
+        self._written = 0  # number of bytes written so far
+        self._mark = 0  # how many of these should have been sent by _due_ns
+        self._due_ns: int | None = None  # when those bytes should have been sent; None if there were none
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
         """Return whether a packet may be sent now; otherwise it would queue behind others and arrive late."""
         return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
 
     def stalled(self, now_ns: int) -> bool:
-        """Return whether the line is stuck, judging by what is left in the output buffer."""
+        """Return whether the line is stuck, judging by how much is left in the output buffer."""
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
-        """Update with the number of bytes written that are still in the output buffer."""
+        """Update the estimate with the number of written bytes that are still in the output buffer."""
         if not size:
             self._due_ns = None
         elif self._due_ns is None or self._written - size >= self._mark:
@@ -78,7 +78,7 @@ class LinePace:
         self._free_ns = max(self._free_ns, now_ns + round(size * self._ns_per_byte))
 
     def on_written(self, size: int, now_ns: int) -> None:
-        """Update with the number of bytes written."""
+        """Update the estimate with the number of bytes just written."""
         self._free_ns = max(self._free_ns, now_ns) + round(size * self._ns_per_byte)
         self._written += size
 
@@ -90,21 +90,21 @@ class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
     ``dropped`` counts packets that were not sent because the line lagged, was stalled, or had no room. Drivers repeat
-    each of them, or send a newer one. Buffers at the far end, and those of pseudo-terminals, which the system reports
-    as empty, are invisible here; therefore sessions hold set-points back while they receive nothing.
+    each of these packets or send a newer one. Buffers at the far end, and those of pseudo-terminals (which the system
+    reports as empty), are not visible here, so sessions hold set-points back while they receive nothing.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
         self.dropped = 0
-        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for written bytes to be sent
+        self.drain_s = _DRAIN_S  #: how long :meth:`close` waits for the bytes already written to be sent
         self._pace = pace
         self._clock = clock
         self._stuck_ns = STUCK_NS
         self._full_ns: int | None = None  # when the buffer became full, or the line stalled
         self._whole = _LONGEST  # number of bytes written since a frame may have been cut
         self._rest = b""  # end of a frame that was only partly written, altered so that the receiver discards it
-        self._cleared = False  # a full buffer was emptied for a stop, with no sign yet that it is read again
-        self._after_stop = 1 << 62  # number of bytes written since a stop; if more are waiting, the stop is among them
+        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows yet that it is being read again
+        self._after_stop = 1 << 62  # bytes written since a stop; if at most this many are waiting, the stop has left
 
     @abstractmethod
     def fileno(self) -> int:
@@ -112,16 +112,16 @@ class ByteStream(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return the received bytes, possibly none. Raises ``OSError`` if the connection has ended."""
+        """Return the bytes received so far, which may be none. Raises ``OSError`` if the connection has ended."""
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
-        """Send a packet, or drop it if there is no room or the line lags. Never waits.
+        """Send a packet, or drop it if there is no room or the line has a backlog. Never waits.
 
-        Raises ``OSError`` if it can't be sent, or no whole packet could be sent for :data:`STUCK_NS`.
+        Raises ``OSError`` if sending fails, or if no whole packet could be sent for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and _LONGEST < waiting <= self._after_stop:  # with less waiting, padding takes as long
+        if stop and _LONGEST < waiting <= self._after_stop:  # if less is waiting, padding takes just as long
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent, whole = 0, False
@@ -147,9 +147,9 @@ class ByteStream(ABC):
     def _rest_of(self, packet: bytes, sent: int) -> bytes:
         """Return the bytes to write before the next packet: the end of a frame whose start was sent.
 
-        That frame is outdated. Its last byte, part of a checksum, is inverted so that the receiver discards it; without
-        the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores signatures
-        still executes a signed frame if only its signature was cut.)
+        That frame is out of date. Its last byte, part of a checksum, is inverted so that the receiver discards it;
+        without the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores
+        signatures still executes a signed frame if only its signature was cut.)
         """
         if sent <= len(self._rest):
             return self._rest[sent:]
@@ -177,13 +177,13 @@ class ByteStream(ABC):
         return 0
 
     def _discard(self) -> bool:
-        """Empty the output buffer, which may cut a frame; return whether, as far as is known, it worked."""
+        """Empty the output buffer, which may cut off a frame; return whether this worked, as far as is known."""
         return False
 
     def _drain(self) -> bool:
-        """Wait briefly until written bytes have been sent; return whether they have."""
+        """Wait briefly for written bytes to be sent; return whether they have been."""
         until_s = time.monotonic() + self.drain_s
-        # On a stuck line only a stop is worth waiting for: the buffer was emptied for it, so it may still be sent.
+        # On a stuck line, only a stop is worth waiting for: it may still be sent since the buffer was emptied for it.
         patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
         while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -209,7 +209,7 @@ class TcpStream(ByteStream):
         self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # TCP needs 0.6 s for a packet that is lost twice
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # missing on macOS
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # not available on macOS
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
 
@@ -218,7 +218,7 @@ class TcpStream(ByteStream):
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return the received bytes, possibly none."""
+        """Return the bytes received so far, which may be none."""
         try:
             data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
@@ -238,11 +238,11 @@ class TcpStream(ByteStream):
         self._socket.close()
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # unavailable, or the connection is gone
+        with suppress(Exception):  # the count is unavailable, or the connection is gone
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone, as unreceived bytes would still be counted
+            self._socket.getpeername()  # raises if the connection is gone; lost bytes would still count as waiting
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -251,7 +251,7 @@ class TcpStream(ByteStream):
 class SerialStream(ByteStream):
     """A serial port, opened with pyserial for exclusive use and with an empty output buffer.
 
-    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` without pyserial.
+    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` if pyserial is missing.
     """
 
     def __init__(self, path: str, baud: int, what: str, extra: str, clock: Clock = monotonic_ns) -> None:
@@ -262,7 +262,7 @@ class SerialStream(ByteStream):
         super().__init__(LinePace(line_speed(path, baud)), clock)
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         self._discard()
-        self._whole = 0  # the previous connection may have cut a frame
+        self._whole = 0  # the previous connection may have left a frame incomplete
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -270,7 +270,7 @@ class SerialStream(ByteStream):
         return number
 
     def read(self) -> bytes:
-        """Return the received bytes, possibly none."""
+        """Return the bytes received so far, which may be none."""
         if not wait_readable(self, 0.0):
             return b""
         data = os.read(self.fileno(), _READ_BYTES)  # pyserial's read() uses select.select: only descriptors below 1024
@@ -291,7 +291,7 @@ class SerialStream(ByteStream):
         before = self._waiting()
         with suppress(Exception):  # termios.error is not an OSError
             self._port.reset_output_buffer()
-            if not before or self._waiting() < before:  # not every port driver can empty it
+            if not before or self._waiting() < before:  # some port drivers can't empty it
                 self._whole, self._rest = 0, b""
                 return True
         return False
@@ -304,6 +304,6 @@ class SerialStream(ByteStream):
 
 
 def line_speed(path: str, baud: int) -> float | None:
-    """Return a serial port's speed in bytes per second; None for USB, where the bit rate is meaningless."""
+    """Return a serial port's speed in bytes per second; None for USB ports, whose bit rate is meaningless."""
     device = Path(path).resolve().name
     return None if re.match(r"ttyACM|(cu|tty)\.usbmodem", device) else baud / _BITS_PER_BYTE

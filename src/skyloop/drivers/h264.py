@@ -1,4 +1,4 @@
-"""Just enough of H.264 to separate pictures, and to detect missing, reordered or resized ones. Pure.
+"""The parts of H.264 needed to separate frames and to detect missing, reordered or resized ones. Pure.
 
 ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annex B, Annex E.
 """
@@ -13,7 +13,7 @@ from skyloop.errors import DecodeError
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
-MAX_SETS: Final = 8  #: maximum number of parameter sets stored of each kind; cameras send one
+MAX_SETS: Final = 8  #: maximum number of parameter sets of each kind to store; cameras send one
 _ANY_START: Final = re.compile(rb"\x00\x00\x01")
 _HEADER_BYTES: Final = 32  # enough for the start of a slice header
 _SET_BYTES: Final = 512  # enough for a sequence parameter set, including scaling lists
@@ -29,26 +29,26 @@ class Sequence:
     """The relevant fields of a sequence parameter set."""
 
     frame_number_bits: int
-    width: int  #: width of the displayed picture [px]
+    width: int  #: width of the displayed image [px]
     height: int
     interlaced: bool = False  #: whether pictures may be fields
-    colour_planes: bool = False  #: whether the colour planes are coded separately
-    gaps_allowed: bool = False  #: whether the sender may leave out pictures, so that their numbers have gaps
+    colour_planes: bool = False  #: whether the colour planes are encoded separately
+    gaps_allowed: bool = False  #: whether the sender may skip frames, so that their numbers have gaps
 
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """The start of a slice header."""
+    """The fields at the start of a slice header."""
 
     is_key: bool
-    is_first: bool  #: whether it is the first slice of its picture
+    is_first: bool  #: whether it is the first slice of its frame
     is_reference: bool
     frame_number: int
-    is_b: bool = False  #: whether it may refer to later pictures
+    is_b: bool = False  #: whether it may refer to later frames
 
 
 def units(stream: bytes) -> list[bytes]:
-    """Return the NAL units in stream data in Annex B format. Bytes before the first start code are skipped."""
+    """Split stream data in Annex B format into its NAL units. Bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -110,7 +110,7 @@ def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
 
 
 def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
-    """Return how many reference pictures are missing between two consecutive ones, by their numbers (7.4.3)."""
+    """Return how many reference frames are missing between two consecutive ones, according to their numbers (7.4.3)."""
     if now.is_key:
         return 0
     turns = 1 << sequence.frame_number_bits
@@ -118,7 +118,7 @@ def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """Skip the fields for the picture order count, which has three types."""
+    """Skip the fields of the picture order count, of which there are three types."""
     kind = bits.exp_golomb()
     if kind == 0:
         bits.exp_golomb()
@@ -167,26 +167,26 @@ class _Bits:
 class Unit:
     """An access unit with the inspector's findings."""
 
-    data: bytes  #: the unit in Annex B format; a key picture includes its parameter sets
+    data: bytes  #: the unit in Annex B format; if it is a key frame, it includes the parameter sets
     is_key: bool  #: whether decoding can start here: it is an IDR picture with known parameter sets
-    after_gap: bool  #: whether pictures are missing before this one, or it is the first
+    after_gap: bool  #: whether frames are missing before this one, or it is the first
     width: int  #: width [px]
     height: int
-    reason: str = ""  #: why pictures of this stream can't be forwarded undecoded; empty if they can
+    reason: str = ""  #: why frames of this stream can't be forwarded without decoding; empty if they can
 
 
 class Inspector:
     """Inspects the access units of one stream in order, without decoding them.
 
-    It remembers parameter sets, which a stream may send only once, and puts them in front of each key picture. If a
-    stream has several sequence parameter sets, the last one counts.
+    It remembers parameter sets, which a stream may send only once, and puts them in front of each key frame. If a
+    stream has several sequence parameter sets, the last one is used.
 
     Args:
-        parameters: Parameter sets from outside the stream (SDP or a container), in Annex B format.
+        parameters: Parameter sets obtained outside the stream (from SDP or a container), in Annex B format.
     """
 
     def __init__(self, parameters: bytes = b"") -> None:
-        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # by type and number of the set
+        self._sets: dict[int, dict[bytes, bytes]] = {SPS: {}, PPS: {}}  # parameter sets by type and number
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         for unit in units(parameters):
@@ -195,8 +195,8 @@ class Inspector:
     def inspect(self, data: bytes) -> Unit | None:
         """Inspect the next access unit, in Annex B format.
 
-        Returns None if it holds no picture, or if its headers are damaged or unknown; then the next unit is marked as
-        following a gap.
+        Returns None if the unit holds no picture, or if its headers are damaged or unknown; the unit after it is then
+        marked as following a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}
@@ -222,7 +222,7 @@ class Inspector:
         return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
 
     def restart(self) -> None:
-        """Record that pictures were left out, so that the next one does not continue the last."""
+        """Record that frames were skipped, so that the next one does not continue the last one."""
         self._before = None
 
     def _is_missing(self, before: Slice, now: Slice) -> bool:
@@ -243,7 +243,7 @@ class Inspector:
             try:
                 sequence = parse_sequence(unit)
             except DecodeError:
-                return  # the set is damaged, so the previous one stays in use and the decoder decides
+                return  # the parameter set is damaged; keep the previous one and leave it to the decoder
             if sequence != self._sequence:
                 self._sequence, self._before = sequence, None
                 for known in self._sets.values():
@@ -256,7 +256,7 @@ class Inspector:
 
 
 def _set_number(unit: bytes) -> bytes:
-    """Return the number of a parameter set, which is the key it is stored under."""
+    """Return the number of a parameter set, which identifies it."""
     bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
     try:
         return bytes([bits.exp_golomb() % 256])

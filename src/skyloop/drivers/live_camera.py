@@ -1,8 +1,8 @@
-"""A network camera or a camera device of this machine: its options in a vehicle's address, and its live video.
+"""A network camera, or a camera device of this machine: its options in a vehicle's address, and its live video.
 
-The video source is the address of a stream, or a device; FFmpeg opens it. The intrinsics are given by ``calibration``,
-the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion`` (k1, k2, p1,
-p2[, k3[, k4, k5, k6]]).
+The video source is the address of a stream or a device, which FFmpeg opens. The intrinsics are given by
+``calibration``, the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and
+``distortion`` (k1, k2, p1, p2[, k3[, k4, k5, k6]]).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 if TYPE_CHECKING:
     from skyloop.drivers.live_container import ContainerStream
 
-STALLED_S: Final = 1.5  #: a stream that is silent for this long, or for three of its periods, is reopened
+STALLED_S: Final = 1.5  #: a stream that delivers nothing for this long, or for three of its periods, is reopened
 _WHERE: Final = "camera"  # source of the events
-OPEN_S: Final = 5.0  #: time limit for connecting, the handshake and the first picture
+OPEN_S: Final = 5.0  #: time limit for connecting, the handshake and the first frame
 DEVICE_FORMAT: Final = "v4l2"
 RTP_PORT: Final = 5600  #: the default port of PX4, ArduPilot's companion computers and QGroundControl
 _PAYLOAD: Final = 96  # GStreamer's default for rtph264pay and rtph265pay
 _RTP_OPTIONS: Final = frozenset({"payload", "codec"})
 _CODECS: Final = {"h264": "H264", "h265": "H265"}
-#: Options that minimise FFmpeg's probing before the first picture, because the frame rate is not needed.
+#: Options that minimise FFmpeg's probing before the first frame, because the frame rate is not needed.
 _LIVE: Final = {"fpsprobesize": "0"}
-#: How long to wait for a late packet before using later ones: a few pictures' time on a radio link.
+#: How long to wait for a late packet before using later ones: the time of a few frames on a radio link.
 _REORDER: Final = {"max_delay": "50000", "reorder_queue_size": "100"}
 _RTSP: Final = {**_LIVE, "allowed_media_types": "video"}
 _WAYS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -55,12 +55,12 @@ _LISTENING: Final = frozenset({"udp", "rtp"})
 class CameraSource:
     """A video source for FFmpeg, with its options."""
 
-    name: str = field(repr=False)  #: address or path, with its secrets
+    name: str = field(repr=False)  #: address or path, including its secrets
     scheme: str  #: scheme of the address; empty for a device
     options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's options
-    sdp: str = ""  #: session description (RFC 4566), if there is no server to provide it
+    sdp: str = ""  #: session description (RFC 4566), if no server provides it
     fallback: Mapping[str, str] | None = None  #: options to retry with if the server refuses the first protocol
-    loses: bool = False  #: whether parts of pictures may get lost unnoticed
+    loses: bool = False  #: whether parts of frames may get lost without being noticed
 
     @property
     def host(self) -> str | None:
@@ -74,7 +74,7 @@ class CameraSource:
 
 
 def source_of(text: str, where: str) -> CameraSource:
-    """Parse the address of a camera, or a device's path; ``where`` begins error messages.
+    """Parse the address of a camera, or a device's path; error messages begin with ``where``.
 
     Raises :class:`UsageError` if the text is neither the address of a supported stream nor a device.
     """
@@ -138,8 +138,8 @@ def check_intrinsics(uri: VehicleUri) -> None:
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
     """Return the intrinsics in an address for frames of the given size [px].
 
-    None unless the address gives the focal length, or a calibration for this aspect ratio. Raises :class:`UsageError`
-    if an option makes no sense, options contradict each other, or the calibration can't be read.
+    Returns None unless the address gives the focal length, or a calibration for this aspect ratio. Raises
+    :class:`UsageError` if an option makes no sense, options contradict each other, or the calibration can't be read.
     """
     if "calibration" in uri.options:
         calibration = _calibration(uri)
@@ -178,7 +178,7 @@ def _distortion(uri: VehicleUri) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class LiveCameraSettings:
-    """A camera's settings. Size and rate are announced before the first picture, and requested from a device."""
+    """A camera's settings. Size and rate are announced before the first frame, and are requested from a device."""
 
     source: CameraSource
     name: str
@@ -186,12 +186,12 @@ class LiveCameraSettings:
     height: int
     fps: float
     stream: bool = True  #: whether its H.264 is forwarded undecoded
-    device_options: dict[str, str] = field(default_factory=dict)  #: options for FFmpeg besides size and rate
+    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's options other than size and rate
     purpose: str = "a camera"  #: what PyAV is needed for, for error messages
 
 
 class LiveCamera:
-    """Publishes the camera's newest picture from :meth:`start` to :meth:`stop`, and keeps reconnecting.
+    """Publishes the camera's newest frame from :meth:`start` to :meth:`stop`, and keeps reconnecting.
 
     PyAV opens it on start. Its H.264 is forwarded undecoded: at once if nothing can have been lost in transit,
     otherwise only after a decoder that rejects damage has accepted it.
@@ -221,7 +221,7 @@ class LiveCamera:
         self._intrinsics = intrinsics
         self._configure = configure
         self._absent = absent
-        self._checks = settings.source.loses  # whether pictures are decoded before being forwarded
+        self._checks = settings.source.loses  # whether frames are decoded before being forwarded
         self._stopped = False
         self._reported: list[str] = []
         relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))

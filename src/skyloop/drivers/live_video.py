@@ -1,8 +1,8 @@
-"""Receive a vehicle's live video, decode it, and show the newest picture; forward H.264 undecoded.
+"""Receive a vehicle's live video, decode it, and show the newest frame; forward H.264 without decoding.
 
-One thread reads frames from the socket as they arrive, so that pictures don't age in a kernel buffer, and keeps
-reconnecting. Another one decodes the frames that are wanted. Between them, the :class:`FrameBacklog` decides which
-frames to drop when decoding is late.
+One thread reads frames from the socket as they arrive, so that they don't grow old in a kernel buffer, and keeps
+reconnecting. Another thread decodes the frames that are wanted. Between these two threads, the :class:`FrameBacklog`
+decides which frames to drop when decoding falls behind.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s
 REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
 LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
-KEYLESS: Final = 600  #: number of pictures without a key picture after which a stream is reported as not forwardable
+KEYLESS: Final = 600  #: number of frames without a key frame after which a stream is reported as not forwardable
 MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
 
 
@@ -46,27 +46,27 @@ class Coded:
 class FrameBacklog:
     """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest wins.
 
-    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, frames
-    before the newest key frame are dropped; the rest must all be decoded, as each refers to the previous one, but only
-    the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
+    While frames are wanted and decoding keeps up, every frame is decoded and shown. If decoding falls behind, frames
+    before the newest key frame are dropped; the rest must all be decoded, because each refers to the previous one, but
+    only the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
     subscriber gets an image at once.
 
-    ``skipped`` counts wanted frames that were not shown because newer ones had arrived.
+    ``skipped`` is the number of frames that were wanted but not shown, because newer ones had arrived.
     """
 
     def __init__(self) -> None:
         self.skipped = 0
-        self._frames: deque[tuple[Coded, bool]] = deque()  # frames, and whether each was wanted on arrival
+        self._frames: deque[tuple[Coded, bool]] = deque()  # each frame, and whether it was wanted on arrival
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def put(self, frame: Coded, *, wanted: bool) -> None:
-        """Add a received frame."""
+        """Add a frame that has just been received."""
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
-            self._drop(1)  # frames that refer to it are lost up to the next key frame, as after any loss
+            self._drop(1)  # frames that refer to this one are lost up to the next key frame, as after any loss
         self._frames.append((frame, wanted))
 
     def take(self, now_ns: int) -> tuple[Coded, bool]:
@@ -89,11 +89,11 @@ class FrameBacklog:
 
 
 class Decoded(NamedTuple):
-    """A decoded picture."""
+    """A decoded frame."""
 
-    number: int  #: number that the vehicle gave the picture
+    number: int  #: the number that the vehicle gave this frame
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    captured_ns: int | None = None  #: capture time; None: that of the frame decoded last
+    captured_ns: int | None = None  #: capture time; None: the same as that of the last frame passed to the decoder
 
 
 class Stream(Protocol):
@@ -105,12 +105,12 @@ class Stream(Protocol):
 
     @property
     def lost_bytes(self) -> int:
-        """Number of bytes outside whole frames."""
+        """Number of bytes that did not belong to a complete frame."""
 
     def read(self) -> list[Coded]:
         """Return the received frames. Raises ``OSError`` if the connection is lost.
 
-        Should return within a tenth of a second: :meth:`LiveVideo.stop` waits for it.
+        Should return within a tenth of a second, because :meth:`LiveVideo.stop` waits for it.
         """
 
     def close(self) -> None: ...
@@ -121,43 +121,43 @@ class Decoder(Protocol):
 
     @property
     def waited(self) -> int:
-        """Number of frames left out, because their reference was missing or a newer frame had been shown."""
+        """Number of frames skipped because a frame they refer to was missing or a newer one had been shown."""
 
     @property
     def damaged(self) -> int:
         """Number of frames that could not be decoded."""
 
     def restart(self) -> None:
-        """Forget the stream so far, which the next frame does not continue."""
+        """Forget the stream so far, because the next frame does not continue it."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame; return its picture, or None if there is none or it is not wanted (``show``).
+        """Decode a frame; return it, or None if there is no image in it or the image is not wanted (``show``).
 
-        Raises :class:`UnsupportedError` for an unsupported codec, and nothing else, whatever the frame contains.
+        Raises :class:`UnsupportedError` for an unsupported codec, but nothing else, whatever the frame contains.
         """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture from the vehicle's selected camera."""
+    """A frame from the vehicle's selected camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
     width: int  #: width [px]
     height: int
     captured_ns: int  #: capture time on this host's monotonic clock; arrival time if the vehicle sends no timestamps
-    number: int  #: number that the vehicle gave the picture, 32 bits
+    number: int  #: number that the vehicle gave the frame, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Publish the picture as a frame of a camera."""
+        """Publish this as a frame of a camera."""
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
 class VideoEvent(Enum):
-    """What a receiver reports besides pictures."""
+    """Events that a receiver reports."""
 
     STREAMING = "streaming"  #: frames are arriving
-    LOST = "lost"  #: there is no connection any more, or none yet; reported once per reason, and retried forever
-    UNSUPPORTED = "unsupported"  #: frames use another codec, or are noise; reported once per series
+    LOST = "lost"  #: the connection was lost or has not been made yet; reported once per reason, and retried forever
+    UNSUPPORTED = "unsupported"  #: frames use another codec, or the data make no sense; reported once per series
     FAULT = "fault"  #: an error of this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
@@ -176,15 +176,15 @@ _EVENTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class VideoCounters:
-    """Counts of frames in all connections, by what happened to them."""
+    """Numbers of frames in all connections, by outcome."""
 
     received: int = 0
     frames: int = 0  #: frames shown
-    waited: int = 0  #: frames left out up to the next key frame, or because a newer one had been shown
+    waited: int = 0  #: frames skipped up to the next key frame, or because a newer one had been shown
     damaged: int = 0  #: frames cut off, stale at the start of a connection, or undecodable
     refused: int = 0  #: frames of an unsupported kind
-    skipped: int = 0  #: frames that were wanted, but overtaken by newer ones
-    lost_bytes: int = 0  #: bytes outside whole frames
+    skipped: int = 0  #: frames that were wanted but superseded by newer ones before decoding
+    lost_bytes: int = 0  #: bytes that did not belong to a complete frame
     reconnects: int = 0  #: connections that delivered frames, not counting the first
 
     def telemetry(self, of: str) -> dict[str, Value]:
@@ -195,20 +195,20 @@ class VideoCounters:
 class LiveVideo:
     """The video of one vehicle.
 
-    While no pictures are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame
-    are kept, so that a new subscriber gets a picture at once. No I/O happens before :meth:`start`.
+    While no frames are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame are
+    kept, so that a new subscriber gets an image at once. Nothing is sent or received before :meth:`start`.
 
     Args:
-        place: Human-readable name of the video's source.
+        place: Human-readable description of where the video comes from.
         connect: Opens a connection, given its number from 0; raises OSError on failure. On the reading thread.
-        make_decoder: Creates the decoder; raises MissingExtraError if none is installed. On the thread of
-            :meth:`start`.
-        show: Called with each picture on the decoding thread; must return quickly.
+        make_decoder: Creates the decoder; raises MissingExtraError if no decoder is installed. Called on the thread
+            that calls :meth:`start`.
+        show: Called with each frame on the decoding thread; must return quickly.
         on_event: Called with each event and its text on either thread; must return quickly.
-        wants: Returns whether pictures are wanted. Called on the reading thread.
-        wants_checked: Returns whether to decode frames even if pictures aren't wanted, because the decoder forwards
-            whole ones. Called on the reading thread.
-        came: Called on the reading thread with every whole frame as it arrives.
+        wants: Returns whether decoded frames are wanted. Called on the reading thread.
+        wants_checked: Returns whether to decode frames even if none are wanted, because undamaged ones are forwarded.
+            Called on the reading thread.
+        came: Called on the reading thread with every complete frame as it arrives.
         clock: A monotonic clock [ns].
         name: Name of the reading thread, and prefix of the decoding thread's name.
     """
@@ -241,8 +241,8 @@ class LiveVideo:
         self._stop = threading.Event()
         self._changed = threading.Condition()  # guards the backlog and the counts of the reading thread
         self._backlog = FrameBacklog()
-        self._wanted = False  # whether frames were wanted when the last one arrived
-        self._shows = False  # whether pictures are wanted, rather than only decoded for the check
+        self._wanted = False  # whether frames were wanted when the last frame arrived
+        self._shows = False  # whether frames are wanted, rather than only decoded as a check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -264,7 +264,7 @@ class LiveVideo:
     def stop(self) -> None:
         """Stop both threads. Idempotent; no callback runs afterwards, unless this is called from one.
 
-        Takes up to 4 s; a connection that takes longer to open or read is abandoned to end by itself.
+        Takes up to 4 s; a connection that takes longer to open or read is left to end by itself.
         """
         self._stop.set()
         with self._changed:
@@ -275,7 +275,7 @@ class LiveVideo:
 
     @property
     def counters(self) -> VideoCounters:
-        """The counters so far. Thread-safe."""
+        """The current counts. Thread-safe."""
         with self._changed:
             stream, decoder = self._stream, self._decoder
             return VideoCounters(
@@ -313,7 +313,7 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """Serve one connection from its start to its end."""
+        """Serve one connection from beginning to end."""
         stream = self._connect(self._connections)
         with self._changed:
             self._stream = stream
@@ -378,7 +378,7 @@ class LiveVideo:
                     self._emit(VideoEvent.FAULT, reported)
 
     def _next(self) -> tuple[Coded, bool] | None:
-        """Wait until there is a frame to decode. Return it and whether to show it; None after :meth:`stop`."""
+        """Wait for a frame to decode. Return the frame and whether to show it; None after :meth:`stop`."""
         with self._changed:
             self._changed.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             if self._stop.is_set():
@@ -392,35 +392,35 @@ class LiveVideo:
 
 
 class StreamRelay:
-    """Forwards H.264 while it is wanted, starting with a key picture, and restarting with one after a gap.
+    """Forwards H.264 while it is wanted, starting with a key frame and restarting with one after a gap.
 
-    Whether pictures are also decoded makes no difference. Not thread-safe.
+    Works the same whether or not frames are also decoded. Not thread-safe.
     """
 
     def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
         self._sink = sink
         self._intrinsics = intrinsics
         self._chain = Chain()
-        self._source: tuple[str, int] | None = None  # camera and connection of the previous picture
+        self._source: tuple[str, int] | None = None  # camera and connection of the previous frame
 
     def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, it will restart with a key picture."""
+        """Return whether a camera's stream is wanted. If not, it will restart with a key frame."""
         wanted = self._sink.wants_stream(camera)
         if not wanted:
             self.restart()
         return wanted
 
     def restart(self) -> None:
-        """Restart with the next key picture."""
+        """Restart with the next key frame."""
         self._source = None
 
     def take(
         self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
     ) -> bool:
-        """Forward an undamaged picture if it is wanted and can be decoded after the last one; return whether it was.
+        """Forward an undamaged frame if it is wanted and can be decoded after the last one; return whether it was.
 
-        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the pictures of the connection, so those
-        left out cause gaps. ``picture``: False if there are only parameters, which are not forwarded.
+        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the frames received on the connection, so
+        skipped ones show as gaps. ``picture``: False if the unit contains only parameters, which are not forwarded.
         """
         if not self.wanted(camera):
             return False
@@ -443,7 +443,7 @@ class StreamRelay:
 
 
 class CheckedRelay:
-    """Forwards the H.264 of a camera whose stream is not known in advance; if it can't, reports once why.
+    """Forwards the H.264 of a camera whose stream is not known in advance; reports once why if it can't.
 
     Not thread-safe.
     """
@@ -453,17 +453,17 @@ class CheckedRelay:
         self._sink = sink
         self._camera = camera
         self._where = where
-        self._refused = (-1, "")  # number of the connection, and the reason
+        self._refused = (-1, "")  # number of the refused connection, and the reason
         self._waited = 0
         self._reported = ""
 
     @property
     def wanted(self) -> bool:
-        """Whether the stream is wanted."""
+        """Whether anyone currently wants the stream."""
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
-        """Forward an undamaged picture; see :meth:`StreamRelay.take`.
+        """Forward an undamaged encoded frame; see :meth:`StreamRelay.take`.
 
         ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded, for the rest of the
         connection; empty if it can.

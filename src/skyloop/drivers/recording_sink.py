@@ -34,10 +34,10 @@ class SeenFrame:
     """A frame, with the arguments of :meth:`skyloop.drivers.base.Sink.frame`."""
 
     camera: str
-    #: A copy, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if malformed or not kept.
+    #: A copy of shape (height, width, 3), (height, width) or, for JPEG, (bytes,); empty if malformed or not kept.
     pixels: NDArray[np.uint8]
     captured_ns: int
-    arrived_ns: int  #: time of the call, on this host's monotonic clock
+    arrived_ns: int  #: when the call was made, on this host's monotonic clock
     width: int
     height: int
     encoding: Encoding
@@ -46,7 +46,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A picture as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
+    """A frame as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
@@ -64,9 +64,9 @@ class RecordingSink:
 
     Args:
         watch: Names of the cameras whose frames are wanted; None: all.
-        keep: How many feedback samples, frames, pictures and events to keep; at most 64 frames with pixels.
-        keep_pixels: Whether to keep a copy of each frame's pixels.
-        record: Whether encoded pictures are wanted, from every camera.
+        keep: How many feedback samples, frames, encoded frames and events to keep; at most 64 frames with pixels.
+        keep_pixels: Whether to keep a copy of the pixels of each frame.
+        record: Whether encoded frames are wanted, from every camera.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class RecordingSink:
         self.feedbacks: deque[Feedback] = deque(maxlen=keep)
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
-        self.remedy = ""  #: the remedy reported with the newest link state
+        self.remedy = ""  #: the remedy reported along with the newest link state
         self.events: deque[VehicleEvent] = deque(maxlen=keep)
         self.problems: list[str] = []
         self.calls = 0
@@ -110,7 +110,7 @@ class RecordingSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep a frame; record a problem if its time or its pixels break the contract."""
+        """Keep a frame; record a problem if its time or its pixels violate the contract."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"frame of {camera}", captured_ns, now_ns)
@@ -121,7 +121,7 @@ class RecordingSink:
             self._notify()
 
     def wants(self, camera: str) -> bool:
-        """Return whether the camera is in ``watch``; True if that is None."""
+        """Return whether the camera is in ``watch``, or ``watch`` is None."""
         return self.watch is None or camera in self.watch
 
     def wanted_fps(self, camera: str) -> float:
@@ -139,7 +139,7 @@ class RecordingSink:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep an encoded picture; record a problem if it isn't in Annex B format, or the first isn't a key picture."""
+        """Keep an encoded frame; record a problem if it isn't in Annex B format, or the first isn't a key frame."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"encoded frame of {camera}", captured_ns, now_ns)
@@ -155,7 +155,7 @@ class RecordingSink:
         return self.record
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Keep a link state with its reason."""
+        """Record a link state with its reason."""
         with self._changed:
             self.links.append((LinkState(state), reason))
             self.remedy = remedy
@@ -171,7 +171,7 @@ class RecordingSink:
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback; None before the first."""
+        """The newest feedback; None before any has arrived."""
         return self.feedbacks[-1] if self.feedbacks else None
 
     @property
@@ -180,9 +180,9 @@ class RecordingSink:
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until a condition holds; return False if it does not within ``timeout_s`` [s].
+        """Wait until a condition holds; return False if this takes longer than ``timeout_s`` [s].
 
-        ``condition`` is called after each of the driver's calls, with the sink's lock held.
+        ``condition`` is called after each call by the driver, with the sink's lock held.
         """
         end = time.monotonic() + timeout_s
         with self._changed:
@@ -243,7 +243,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """Describe a sample's numbers that are not finite, or so large that they must have the wrong unit."""
+    """Describe those numbers in a sample that are not finite, or so large that they must have the wrong unit."""
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
         value = getattr(feedback, name)
@@ -270,7 +270,7 @@ _TYPES: Final[dict[ParameterType, tuple[type, ...]]] = {
 
 
 def mismatch(parameter: Parameter, value: Value) -> str:
-    """Return why a value does not fit a parameter's type, choices or range, as a predicate; empty if it fits."""
+    """Return why a value does not fit a parameter's type, choices or range, worded as a predicate; empty if it fits."""
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
         return f"is not of type {parameter.type}"
@@ -307,7 +307,7 @@ def another_value(parameter: Parameter) -> Value:
 def _another_number(value: float, parameter: Parameter) -> float:
     low, high = parameter.minimum, parameter.maximum
     if low is not None and high is not None:
-        if parameter.type is ParameterType.INT:  # an adjacent one, as a vehicle may accept only part of a wide range
+        if parameter.type is ParameterType.INT:  # the next one: a vehicle may accept only part of a wide range
             return value + 1 if value < high else value - 1
         return (value + low + high) / 3
     if high is not None:
@@ -316,7 +316,7 @@ def _another_number(value: float, parameter: Parameter) -> float:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Return whether two values are equal, numbers within a relative 1e-5 or an absolute 1e-6."""
+    """Return whether two values are equal; numbers may differ by a relative 1e-5 or an absolute 1e-6."""
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, (int, float)) and isinstance(other, (int, float)):

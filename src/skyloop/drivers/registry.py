@@ -28,9 +28,9 @@ def driver_class(scheme: str) -> type[Driver]:
     """Import and return the driver class for a scheme, for example ``ardrone``.
 
     Raises:
-        UnknownNameError: No installed package claims the scheme.
-        DriverError: Two packages claim the scheme, or the class can't be loaded; the message names the packages.
-        MissingExtraError: A package that the driver needs is not installed.
+        UnknownNameError: If no installed package claims the scheme.
+        DriverError: If two packages claim the scheme, or the class can't be loaded; the message names the packages.
+        MissingExtraError: If a package that the driver needs is not installed.
     """
     known = scheme, tuple(sys.path)
     if known in _loaded and _loaded[known].__module__ in sys.modules:

@@ -11,7 +11,7 @@ The vehicle at that address must answer and, if it can fly, be on the ground wit
 off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle unless it is tied down or
 in a net.** A vehicle that can't fly is not commanded.
 
-Tests of abilities that the vehicle lacks are skipped. The module does not import pytest.
+Tests of features that the vehicle lacks are skipped. The module does not import pytest.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ __all__ = ["DriverSuite", "RecordingSink"]
 
 APPLY_S: Final = 0.05
 NEAR_RAD: Final = 0.3  #: tolerance for the commanded heading [rad]
-#: Returns how far the vehicle moved between two samples, with its sign; None if the vehicle does not report it.
+#: Function that returns the signed distance the vehicle moved between two samples; None if it is not reported.
 Measure = Callable[[Feedback, Feedback], float | None]
 _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
 
 class DriverSuite:
-    """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
+    """Base class for a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
 
     For a vehicle that is slower or moves less, override the class attributes below; override :meth:`vehicle_disappears`
     and :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a
@@ -76,7 +76,7 @@ class DriverSuite:
 
     uri: ClassVar[str] = ""  #: address of the vehicle to test with
 
-    connect_timeout_s: ClassVar[float] = 5.0  #: how long the link may take to come up [s]; others are limits too
+    connect_timeout_s: ClassVar[float] = 5.0  #: time limit for the link to come up [s]; the next ones are limits, too
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
     takeoff_timeout_s: ClassVar[float] = 15.0
@@ -104,12 +104,12 @@ class DriverSuite:
         """Return a new, unopened driver. By default, its class is found by the entry point for the URI's scheme.
 
         Args:
-            uri: The address of the vehicle to test with, perhaps with an option that must be refused.
+            uri: The address of the vehicle to test with; it may include an option that must be refused.
         """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Make the vehicle disappear for the open driver: switch off its radio, or stop its emulator.
+        """Make the vehicle that the open driver uses disappear: switch off its radio, or stop its emulator.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -117,7 +117,7 @@ class DriverSuite:
         raise unittest.SkipTest("this suite does not know how to make the vehicle disappear")
 
     def vehicle_appears(self) -> None:
-        """Bring the vehicle back.
+        """Make the vehicle reachable again.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -136,13 +136,13 @@ class DriverSuite:
 
         Args:
             watch: Names of the cameras whose frames are wanted; None: all.
-            record: Whether encoded pictures are wanted.
+            record: Whether encoded frames are wanted.
 
         Yields:
             The open driver and its sink.
 
         Raises:
-            AssertionError: The link was not UP within :attr:`connect_timeout_s`, or the driver
+            AssertionError: If the link was not UP within :attr:`connect_timeout_s`, or the driver
                 broke the contract of :class:`skyloop.drivers.base.Sink`.
         """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
@@ -158,8 +158,8 @@ class DriverSuite:
     # Before opening ------------------------------------------------------------------------------------------------
 
     def test_constructor_does_no_io(self) -> None:
-        """A constructor starts no thread and opens no descriptor, and close() without open() does nothing."""
-        self.new_driver()  # fill import caches first, because they are not the driver's resources
+        """The constructor starts no threads and opens no descriptors, and close() without open() does nothing."""
+        self.new_driver()  # fill the import caches first, because they are not the driver's resources
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
         assert _resources() == before, "a constructor started a thread or opened a descriptor"
@@ -198,7 +198,7 @@ class DriverSuite:
     # Life cycle ----------------------------------------------------------------------------------------------------
 
     def test_close_is_idempotent_and_final(self) -> None:
-        """A second close does nothing, and the sink is not called after the first."""
+        """A second close() does nothing, and the sink is not called after the first one."""
         with self.opened() as (driver, sink):
             sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
             driver.close()
@@ -228,7 +228,7 @@ class DriverSuite:
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
-        with self.opened() as (_, sink):  # from here on, resources that libraries keep for themselves exist
+        with self.opened() as (_, sink):  # libraries have now created the resources that they keep for themselves
             self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
@@ -260,7 +260,7 @@ class DriverSuite:
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
-        """Frames arrive, are recent, and have the names and sizes of the announced cameras."""
+        """Frames arrive, are recent, and match the announced cameras in name and size."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
@@ -280,7 +280,7 @@ class DriverSuite:
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
-        """Encoded pictures arrive, and have the names and sizes of the announced cameras."""
+        """Encoded frames arrive, and match the announced cameras in name and size."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
@@ -296,7 +296,7 @@ class DriverSuite:
             )
 
     def test_link_lost_and_found(self) -> None:
-        """The link is reported LOST with a reason when the vehicle disappears, and UP when it is back."""
+        """The link is reported as LOST with a reason when the vehicle disappears, and as UP when it returns."""
         with self.opened() as (_, sink):
             self.wait_for_feedback(sink)
             self.vehicle_disappears()
@@ -314,7 +314,7 @@ class DriverSuite:
     def test_apply_returns_what_was_applied_at_once(self) -> None:
         """``apply`` returns a finite action within :data:`APPLY_S`.
 
-        Runs on the ground, with actions that do not take off; flying has its own test.
+        Runs on the ground, using actions that do not take off; flight has its own test.
         """
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
@@ -337,7 +337,7 @@ class DriverSuite:
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
-        """On the ground, a repeated action does the same as a new one while nothing else commands the vehicle."""
+        """On the ground, repeating an action has the same effect as a new one if nothing else commands the vehicle."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
@@ -380,7 +380,7 @@ class DriverSuite:
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             end = time.monotonic() + self.feedback_timeout_s
-            while not (writable := self._writable(driver)):  # a driver may need to request them first
+            while not (writable := self._writable(driver)):  # a driver may have to request the parameters first
                 if time.monotonic() > end:
                     raise unittest.SkipTest(f"parameters() lists no writable one within {self.feedback_timeout_s} s")
                 time.sleep(0.05)
@@ -413,9 +413,9 @@ class DriverSuite:
     # Flight --------------------------------------------------------------------------------------------------------
 
     def test_flight(self) -> None:
-        """The vehicle takes off, moves both ways along each axis with the right sign, and lands.
+        """The vehicle takes off, moves in both directions along each axis with the right sign, and lands.
 
-        If it supports positions, it also flies to some.
+        If it supports positions, it also flies to some positions.
         """
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
@@ -462,7 +462,7 @@ class DriverSuite:
             self._stands(sink, "a take-off from before the link was back", at_once=True)
 
     def _stands(self, sink: RecordingSink, what: str, *, at_once: bool = False) -> None:
-        """Check that the vehicle stays on the ground for ``stand_s``, after time to land unless ``at_once``."""
+        """Check that the vehicle stays on the ground for ``stand_s``; unless ``at_once``, let it land first."""
         if not at_once:
             time.sleep(1.0)  # time for telemetry to reflect the last command
             sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, self.land_timeout_s)
@@ -471,7 +471,7 @@ class DriverSuite:
         assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
-        """On the ground, an emergency stop is reported, and ends only with a reset."""
+        """On the ground, an emergency stop is reported, and only a reset ends it."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
@@ -494,7 +494,7 @@ class DriverSuite:
             sink: The open driver's sink.
 
         Raises:
-            AssertionError: None arrived within :attr:`feedback_timeout_s`.
+            AssertionError: If none arrived within :attr:`feedback_timeout_s`.
         """
         received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"
@@ -520,13 +520,13 @@ def _check_rotation(name: str, rotation: tuple[float, ...]) -> None:
 
 
 class Flight:
-    """One flight in the suite, with the vehicle's own take-off and landing if it has them, otherwise by set-points.
+    """One flight in the suite, using the vehicle's own take-off and landing if it has them, and set-points otherwise.
 
-    Speeds, distances and time-outs are the suite's. Whatever does not happen in time raises ``AssertionError``.
+    Uses the suite's speeds, distances and time-outs. Raises ``AssertionError`` when one of the latter is exceeded.
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
-        """Begin with an open driver whose link is up; skip the test if it supports no set-points."""
+        """Prepare a flight with an open driver whose link is up; skip the test if it supports no set-points."""
         self.suite = suite
         self.driver = driver
         self.sink = sink
@@ -559,13 +559,13 @@ class Flight:
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
             return
-        self.driver.check(Takeoff())  # as the proxy does before it climbs
+        self.driver.check(Takeoff())  # check as the proxy does before it climbs
         self.set_point(up=self.suite.climb)
         self.until(lambda f: f.altitude_m is None or f.altitude_m > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait; a vehicle without its own landing descends until it is landed or below 0.1 m."""
+        """Land and wait; a vehicle without a landing command descends until it is landed or below 0.1 m."""
         if "land" in self.actions:
             self.driver.apply(Land())
             self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
@@ -579,10 +579,10 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude that goes there.
+        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude to match.
 
-        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. It is
-        sent only once, because the driver must keep it in force.
+        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. The
+        command is sent only once, because the driver must keep it in force.
         """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
@@ -592,7 +592,7 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move in both directions along each axis, which is needed to check the sign."""
+        """Move in both directions along each axis, so that the sign can be checked."""
         suite = self.suite
         for sign in (1.0, -1.0):
             self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
@@ -623,7 +623,7 @@ class Flight:
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not report what is measured for this axis
+            return  # the vehicle does not report the quantity measured for this axis
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -635,7 +635,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Wait until the vehicle is slow again, if it reports its speed, because after an attitude it coasts."""
+        """Wait until a vehicle that reports its speed is slow again, because it coasts after an attitude."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -643,7 +643,7 @@ class Flight:
 
 
 def _summary(feedback: Feedback | None) -> str:
-    """Return the fields that a driver filled in, and their age, for an error message."""
+    """Return the fields that a driver filled in, and the age of the feedback, for an error message."""
     if feedback is None:
         return "none"
     age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9
@@ -665,7 +665,7 @@ def _turned(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed if the position is unknown."""
+    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed, if there is no position."""
     if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
     east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]

@@ -18,7 +18,7 @@ _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
 class VehicleUri:
-    """A parsed vehicle address that never shows its secrets.
+    """A parsed vehicle address that doesn't reveal its secrets.
 
     ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles don't contain users, passwords or keys (see
     ``skyloop.address``). Only code that opens the vehicle reads them, with :meth:`reveal_place` and :meth:`reveal`.
@@ -34,7 +34,7 @@ class VehicleUri:
         given = dict(options or {})
         broken = is_broken(given)
         self.scheme: Final = scheme  #: the driver's name
-        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
+        #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or empty.
         self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
         #: Names and values as given, percent-decoded.
         self.options: Final[Mapping[str, str]] = {
@@ -74,11 +74,11 @@ class VehicleUri:
         return VehicleUri, (self.scheme, self.place, self.options, str(self))
 
     def reveal_place(self) -> str:
-        """Return the place with its secrets. Use it only to open the place, never to show or store it."""
+        """Return the place with its secrets. Use the result only to open the place; never show or store it."""
         return self._given[0]
 
     def reveal(self, option: str) -> str | None:
-        """Return an option with its secrets, like :meth:`reveal_place`; None if it was not given."""
+        """Return an option with its secrets, as :meth:`reveal_place` does for the place; None if it was not given."""
         return self._given[1].get(option)
 
     def reveal_text(self) -> str:
@@ -88,7 +88,7 @@ class VehicleUri:
     def scrub(self, text: str) -> str:
         """Return a text, for example a library's error, with the secrets of this address hidden."""
         for given, shown in self._secrets:
-            if len(given) < _SHORT_SECRET:  # hiding it inside words would hide, and thereby reveal, too much
+            if len(given) < _SHORT_SECRET:  # hiding it within words would hide too much, and so give it away
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
             else:
                 text = text.replace(given, shown)
@@ -104,7 +104,7 @@ class VehicleUri:
             maximum: Largest allowed value.
 
         Raises:
-            UsageError: The option is not a finite number within the range.
+            UsageError: If the option is not a finite number within the range.
         """
         given = self.reveal(option)
         if given is None:
@@ -121,7 +121,7 @@ class VehicleUri:
         return value
 
     def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
-        """Return an option as a whole number within a range; arguments and errors are those of :meth:`number`."""
+        """Return an option as a whole number within a range; arguments and errors are the same as in :meth:`number`."""
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
             raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
@@ -142,10 +142,10 @@ class VehicleUri:
 
 
 def host_and_port(text: str) -> tuple[str, int] | None:
-    """Return a host and its port; None for anything else.
+    """Split an address into a host and a port; return None if it is anything else.
 
-    For example ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` or ``[fe80::1%eth0]:14550``: an IPv6
-    address is in brackets, which are not part of the host.
+    Examples are ``192.168.1.1:14550``, ``drone.local:14550``, ``[::]:14550`` and ``[fe80::1%eth0]:14550``; the brackets
+    around an IPv6 address are not part of the host.
     """
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 1 <= int(port) <= 65_535:

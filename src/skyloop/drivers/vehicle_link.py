@@ -24,7 +24,7 @@ from skyloop.messages import AnyAction, EventKind, Severity
 
 NAME_WAIT_S: Final = 0.2  #: time that suffices for most name look-ups
 PAUSE_S: Final = 0.03  #: pause after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: how often silent sockets are renewed, as this host's address may have changed
+RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets that receive nothing: this host may have a new address
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: maximum number of datagrams read before commands get their turn
 
@@ -43,7 +43,7 @@ class Readable(Protocol):
 class NameLookup:
     """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
 
-    It handles one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
+    It looks up one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
     that also serves others.
     """
 
@@ -54,11 +54,11 @@ class NameLookup:
 
     @property
     def answered(self) -> bool:
-        """Whether a pending look-up has finished, so that it is worth calling :meth:`address` again."""
+        """Whether a pending look-up has finished, so that :meth:`address` is worth calling again."""
         return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for at most ``wait_s``."""
+        """Return a host's first address. Blocks for up to ``wait_s``."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -86,17 +86,17 @@ def _resolve(question: Future[str], host: str, family: socket.AddressFamily) -> 
 class VehicleLink(ABC, Generic[S]):
     """Serves a session in its own thread from :meth:`start` to :meth:`stop`.
 
-    The session makes all decisions while ``lock`` is held; its callbacks run while it is free. A subclass for a kind of
-    vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each socket that
-    it opens to :meth:`_watch`.
+    The session makes all decisions while ``lock`` is held; its callbacks run after the lock is released. A subclass for
+    a kind of vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each
+    socket that it opens to :meth:`_watch`.
 
     Args:
         name: Name of the thread.
         session: The vehicle's protocol.
-        deliver: Called on the link's thread with the session's callbacks for the sink.
+        deliver: Called on the link's thread with the callbacks that the session has for the sink.
         clock: A monotonic clock [ns].
         family: Address family for looking up the host.
-        close_s: How long :meth:`stop` waits for the thread.
+        close_s: How long :meth:`stop` waits for the thread to end.
         serve: Hands the link to a thread that serves several links; None: the link has its own thread.
     """
 
@@ -147,7 +147,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Pass an action to the session, and send it at once if the pace allows; return the result. Thread-safe."""
+        """Pass an action to the session, and send it at once if possible; return the resulting action. Thread-safe."""
         return self._decide(partial(self.session.command, action))
 
     # For methods of subclasses that the proxy's threads call ------------------------------------------------------
@@ -166,9 +166,9 @@ class VehicleLink(ABC, Generic[S]):
     def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Send a request; return the vehicle's answer, or ``otherwise`` if it is late. Not on the link's thread.
+        """Send a request; return the answer, or ``otherwise`` if none arrives in time. Never on the link's thread.
 
-        ``ask`` is called with the lock held; its argument is the function that receives the answer.
+        ``ask`` is called with the lock held, and is given the function to call with the answer.
         """
         done = threading.Event()
         answers: list[str | None] = []
@@ -187,31 +187,31 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _open_sockets(self) -> None:
-        """Replace the sockets with new ones. On the link's thread, with the lock free.
+        """Replace the sockets with new ones. Called on the link's thread, without holding the lock.
 
         Raises ``OSError`` if they can't be opened; the link retries.
         """
 
     @abstractmethod
     def _close_sockets(self) -> None:
-        """Close the sockets of :meth:`_open_sockets`. With the lock held."""
+        """Close the sockets of :meth:`_open_sockets`. The lock is held."""
 
     @abstractmethod
     def _send_due(self, now_ns: int) -> None:
-        """Send everything due. With the lock held, on any thread."""
+        """Send everything that is due. Called with the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return the time after which sockets are reopened, counted from their opening; None: not in the present state.
+        """Return how long after opening the sockets they are reopened; None if they aren't at present.
 
         The default suits UDP: sockets are reopened while nothing is received. Called with the lock held.
         """
         return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
-        """Do work that has a pace of its own. With the lock held, on the link's thread."""
+        """Do work at regular intervals. Called with the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
-        """Call a function whenever a source is readable, on the link's thread, with the lock free."""
+        """Call a function on the link's thread, without holding the lock, whenever a source is readable."""
         self._selector.register(source, selectors.EVENT_READ, ready)
 
     def _forget(self, source: Readable) -> None:
@@ -238,11 +238,11 @@ class VehicleLink(ABC, Generic[S]):
                     handle(datagram, self._clock())
 
     def _send_datagram(self, port: socket.socket, datagram: bytes) -> None:
-        """Send a datagram; report failures to the session. With the lock held."""
+        """Send a datagram; report failures to the session. Called with the lock held."""
         try:
             port.send(datagram)
         except BlockingIOError:
-            pass  # it is lost, as any datagram may be
+            pass  # the datagram is lost, as any datagram may be
         except OSError as error:
             self.session.failed(error)
 
@@ -262,7 +262,7 @@ class VehicleLink(ABC, Generic[S]):
                 self.session.failed(error)
 
     def _step(self, *, wait: bool = True, look: bool = True) -> None:
-        self._renew()  # before the wait, so that no socket is closed between becoming readable and being read
+        self._renew()  # renew sockets before waiting, so that none is closed between becoming readable and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
@@ -305,7 +305,7 @@ class VehicleLink(ABC, Generic[S]):
         return self._selector.fileno()
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work; see :class:`skyloop.drivers.base.ServedLink`."""
+        """Do all pending work, as described in :class:`skyloop.drivers.base.ServedLink`."""
         if self._stopping.is_set():
             return None
         self._within = threading.get_ident()
@@ -322,7 +322,7 @@ class VehicleLink(ABC, Generic[S]):
 
     def _wake(self) -> None:
         """Wake the link's thread. Thread-safe."""
-        with suppress(OSError):  # the thread is awake already, or it has ended
+        with suppress(OSError):  # the thread is already awake or has ended
             self._waker.send(b"\0")
 
     def _drain_wakeups(self) -> None:
@@ -332,14 +332,14 @@ class VehicleLink(ABC, Generic[S]):
 
 
 class ConnectionLink(VehicleLink[S], Generic[S, C]):
-    """A link over one connection, which is reopened when it breaks or stays silent.
+    """A link over one connection, which is reopened when it breaks or delivers nothing.
 
     A subclass for a kind of vehicle implements :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
     """
 
     RETRY_NS: ClassVar[int]  #: pause between connection attempts
 
-    _silent_ns: int | None = None  # duration of silence after which the connection is reopened; None: never
+    _silent_ns: int | None = None  # the connection is reopened after this long without data; None: never
     _connection: C | None = None
     _broken = False  # whether nothing more can be sent
 
@@ -358,10 +358,10 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
         """
 
     def _on_end(self, connection: C) -> None:
-        """Send everything due before the connection is closed for good. With the lock held."""
+        """Send everything that is due before the connection is closed for good. Called with the lock held."""
 
     def _on_broken(self, error: OSError, now_ns: int) -> None:
-        """Handle a connection that accepts no more data. With the lock held."""
+        """Handle a connection that no longer accepts data. Called with the lock held."""
         self._broken = True
         self.session.broken(error, now_ns)
 

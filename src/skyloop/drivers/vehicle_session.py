@@ -1,6 +1,6 @@
-"""What the sessions of all vehicles share: the link's state and its reasons, pending events, the emergency stop.
+"""The parts common to all vehicle sessions: the link's state and its reasons, pending events, the emergency stop.
 
-Pure, except for :func:`serial_trouble`, which inspects the port's device.
+Pure except for :func:`serial_trouble`, which inspects the port's device.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
-REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
-_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors for a port locked by another program
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reports of a reason while nothing is received
+_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors when another program has locked the port
 _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of ports below /dev
 _MAX_LISTED_PORTS: Final = 4  # maximum number of ports listed in a message
 
@@ -37,7 +37,7 @@ def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
-    """How long a vehicle may be silent [ns] before its link counts as degraded or lost."""
+    """Time without data [ns] after which a vehicle's link counts as degraded or lost."""
 
     degraded_ns: int
     lost_ns: int
@@ -60,15 +60,15 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
 
 
 class Arrival(Enum):
-    """A packet's place in the order, according to its number."""
+    """How a packet's number relates to those before it."""
 
     NEW = auto()
-    LATE = auto()  #: later packets overtook it
-    RESTARTED = auto()  #: the vehicle has restarted, and counts from the start again
+    LATE = auto()  #: packets with higher numbers arrived before it
+    RESTARTED = auto()  #: the vehicle has restarted and counts from the beginning
 
 
-RESTART_RUN: Final = 5  #: number of packets with low numbers, in order among themselves, that prove a restart
-RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and the last, which must not be one burst
+RESTART_RUN: Final = 5  #: number of packets with low, increasing numbers that prove a restart
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and last, to rule out a single burst
 
 
 class RestartWatch:
@@ -81,14 +81,14 @@ class RestartWatch:
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
         self._tolerance, self._wrap = tolerance, wrap
         self._newest: int | None = None
-        self._behind: tuple[int, int, int] | None = None  # the last number behind, how many were, arrival of the first
+        self._behind: tuple[int, int, int] | None = None  # last low number, count, arrival of the first
 
     def forget(self) -> None:
-        """Accept the next packet as new, because the vehicle was silent."""
+        """Accept the next packet as new, because nothing was received from the vehicle for a while."""
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
-        """Classify a packet, which has just arrived, by its number."""
+        """Classify a packet that has just arrived by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
@@ -109,8 +109,8 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: While nothing is received, a request is kept, or sent, for this long after its last repeat. An application that still
-#: wants it keeps repeating it; otherwise it might interfere with another application's flight.
+#: How long after its last repeat a request is kept, or sent, while nothing is received. An application that still wants
+#: it keeps repeating it; otherwise it might interfere with another application's flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
@@ -118,32 +118,32 @@ class VehicleSession(ABC):
     """The protocol between one opened driver and its vehicle. Not thread-safe.
 
     Time is an argument; bytes go in and out. Calls to the proxy's sink are collected as callbacks, which the caller
-    runs while it holds no lock. A subclass for a kind of vehicle sets ``_received_ns`` at each valid packet, and calls
-    :meth:`_check_silence` at each poll.
+    runs without holding any lock. A subclass for a kind of vehicle sets ``_received_ns`` on each valid packet and calls
+    :meth:`_check_silence` on each poll.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
 
     def __init__(self, now_ns: int) -> None:
         self.due_ns = now_ns  #: when there will next be something to send
-        self.link_state: LinkState | None = None  #: the state last reported
+        self.link_state: LinkState | None = None  #: the last state reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # when the vehicle was last received; None: not since opening or loss
+        self._received_ns: int | None = None  # when data last arrived; None: not since opening or losing the link
         self._unreachable = ""
         self._remedy = ""  # what to do if the vehicle is unreachable
         self._reported_reason = ""
         self._reported_ns = now_ns
-        self._landing_ns: int | None = None  # when a landing was last requested or, if later, the vehicle last received
+        self._landing_ns: int | None = None  # time of the last request to land or, if later, of the last data
 
     @property
     def is_receiving(self) -> bool:
-        """Whether data from the vehicle are arriving, or were until just now."""
+        """Whether data are arriving from the vehicle, or were until a moment ago."""
         return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action; return what is applied, within the limits. Raises DriverError if that is impossible."""
+        """Accept an action; return what is applied within the limits. Raises DriverError if that is impossible."""
 
     @abstractmethod
     def close(self) -> None:
@@ -154,12 +154,12 @@ class VehicleSession(ABC):
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
-        """Record an error of a socket or port, with a remedy for people."""
+        """Record an error of a socket or port, with a remedy for the user."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
     def connected(self) -> None:  # noqa: B027  most connections need nothing
-        """Handle a new connection, after which no data from an older one arrive."""
+        """Handle a new connection; no data from older ones arrive after it."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
         """Handle an open connection that accepts no more data: the vehicle is lost even if it still sends."""
@@ -187,7 +187,7 @@ class VehicleSession(ABC):
         """
 
     def _advice(self) -> str:
-        """Return an instruction for people, for use while nothing is received although nothing has failed."""
+        """Return an instruction for the user, to show while nothing is received although nothing has failed."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -195,10 +195,10 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """Drop all state of the lost vehicle, so that everything starts over with its next packet."""
+        """Discard all state of the lost vehicle, so that its next packet starts from scratch."""
 
     def _keep(self, action: AnyAction, now_ns: int) -> None:
-        """Record an accepted action: a landing is kept while nothing is received, but not forever."""
+        """Record an accepted action: a landing is remembered while nothing is received, but not forever."""
         if not isinstance(action, Idle):
             self._landing_ns = now_ns if isinstance(action, Land) else None
 
@@ -238,7 +238,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` must be called next; ``latest_ns`` at the latest."""
+        """Return when :meth:`_check_silence` must be called next; never later than ``latest_ns``."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -265,14 +265,14 @@ class VehicleSession(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkTrouble:
-    """Why a vehicle can't be reached."""
+    """The reason why a vehicle can't be reached."""
 
     reason: str  #: what failed; may be empty
-    remedy: str = ""  #: an instruction for people; may be empty
+    remedy: str = ""  #: an instruction for the user; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
-    """Describe a socket's error."""
+    """Describe the error of a socket."""
     if isinstance(error, socket.gaierror):
         remedy = "correct the name in the address, or join a network where it is known"
         return LinkTrouble(f"its name is unknown: {error.strerror}", remedy)
@@ -316,42 +316,42 @@ def _permission(port: str, status: os.stat_result) -> str:
     return f"join the group {group}: sudo usermod -a -G {group} $USER, then log in again"
 
 
-PACE_NS: Final = nanoseconds(0.1)  #: interval between two repeats
+PACE_NS: Final = nanoseconds(0.1)  #: interval between repeats
 GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop not confirmed by the vehicle this long after the press is abandoned
 AGAIN_NS: Final = nanoseconds(0.3)  #: after a pause this long, a request counts as a new press rather than a repeat
-SETTLE_NS: Final = nanoseconds(0.5)  #: reports received sooner than this after the press may predate it
+SETTLE_NS: Final = nanoseconds(0.5)  #: reports that arrive sooner than this after the press may predate it
 
 
 class MotorStop:
     """One emergency stop of any driver, from the press until it is reset or abandoned.
 
-    A driver knows how to tell that the motors are off, and which bytes stop them; this decides everything else.
-    While it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not data
-    arrive from the vehicle, and again every 0.1 s until the vehicle confirms it; until then, the vehicle's own state is
-    reported. If the vehicle has not confirmed it 10 s after the press, the stop ends: it must not be sent minutes
-    later, and the vehicle must be free to land. Not thread-safe.
+    A driver knows how to tell that the motors are off and which bytes stop them; everything else is decided here. While
+    it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not the vehicle
+    is sending data, and again every 0.1 s until the vehicle confirms it; until then, the state reported is the
+    vehicle's own. If the vehicle has not confirmed it 10 s after the press, the stop is abandoned, because it must not
+    be sent minutes later and the vehicle must be free to land. Not thread-safe.
     """
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:
         self._give_up = give_up
         self._begun_ns: int | None = None  # time of the first press
-        self._pressed_ns = 0  # time of the newest press that was not a repeat
+        self._pressed_ns = 0  # time of the newest press, not counting repeats
         self._heard_ns = 0  # time of the newest press, including repeats
         self._sent_ns: int | None = None
         self._shown = self._was_shown = False
 
     @property
     def active(self) -> bool:
-        """Whether it has been pressed, and neither reset nor abandoned since."""
+        """Whether the stop has been pressed and has since been neither reset nor abandoned."""
         return self._begun_ns is not None
 
     @property
     def shown(self) -> bool:
-        """Whether it is active and the vehicle last reported its motors off, so that the state is ``EMERGENCY``."""
+        """Whether the stop is active and the vehicle last reported its motors off; the state is then ``EMERGENCY``."""
         return self.active and self._shown
 
     def press(self, now_ns: int) -> None:
-        """Stop the motors, or keep stopping them. Each press restarts the time limit."""
+        """Stop the motors, or continue to stop them. Each press restarts the time limit."""
         if self._begun_ns is None:
             self._begun_ns, self._sent_ns, self._shown, self._was_shown = now_ns, None, False, False
             self._pressed_ns = now_ns
@@ -360,13 +360,13 @@ class MotorStop:
         self._heard_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
-        """Return whether a report received at ``seen_ns`` was certainly sent after the press."""
+        """Return whether a report received at ``seen_ns`` must have been sent after the press."""
         return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
-        """Advance an active stop; return whether to send it now. Call it at each tick, even without telemetry.
+        """Advance an active stop; return whether to send it now. Call it at every tick, even if no telemetry arrived.
 
-        ``shown``: whether the vehicle reports that its motors are off; None if there is no new information.
+        ``shown``: whether the vehicle reports that its motors are off; None if it has reported nothing new.
         """
         if self._begun_ns is None:
             return False
@@ -384,9 +384,9 @@ class MotorStop:
         return True
 
     def reset(self) -> None:
-        """Let the motors run again. Does nothing if no stop is active.
+        """Allow the motors to run again. Does nothing if no stop is active.
 
-        Raises :class:`DriverError` if the vehicle has not confirmed the stop, which is still being sent.
+        Raises :class:`DriverError` if the vehicle has not confirmed the stop, in which case it is still being sent.
         """
         if self.active and not self.shown:
             raise DriverError("the motors still run, or are still armed: the stop has not shown yet")

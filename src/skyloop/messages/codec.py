@@ -26,7 +26,7 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
 
-#: What a packet can hold, in the order of :class:`Kind`.
+#: All types of sample that a packet can hold, in the order of :class:`Kind`.
 Sample = (
     Command
     | Feedback
@@ -83,8 +83,7 @@ _BY_PREFIX: Final = {
 def encode(sample: Sample) -> bytes:
     """Encode a sample as a packet.
 
-    Raises ``ValueError`` if the body is larger than :data:`MAX_BODY`, which only free text or native telemetry can
-    cause.
+    Raises ``ValueError`` if free text or native telemetry makes the body larger than :data:`MAX_BODY`.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:
@@ -97,7 +96,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 
     Raises :class:`DecodeError` if the bytes are not a packet with a valid sample.
     """
-    # One look-up checks signature, version, kind and reserved bytes; only a failure is analysed further.
+    # A single look-up checks signature, version, kind and reserved bytes; only failures are analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
     size = len(packet) - HEADER_SIZE
     if decoder is None or not 0 <= size <= MAX_BODY or _unpack_length(packet, _PREFIX_SIZE)[0] != size:
@@ -113,7 +112,7 @@ def decode(packet: bytes | memoryview) -> Sample:
 def packet_kind(packet: bytes | memoryview) -> int:
     """Return a packet's kind, after checking that its header matches its length.
 
-    Raises :class:`DecodeError` if the header is of another version, or does not match the packet.
+    Raises :class:`DecodeError` if the header has a different version or does not match the packet.
     """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are too few for the header of {HEADER_SIZE}")

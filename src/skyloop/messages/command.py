@@ -17,7 +17,7 @@ from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
 MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is rejected as a mistake [m]
-MAX_YAW_RAD: Final = 1000.0  #: so is a larger yaw [rad]
+MAX_YAW_RAD: Final = 1000.0  #: a yaw larger than this is rejected, too [rad]
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -35,7 +35,7 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def problem(self) -> str:
-        """Human-readable reason why the numbers make no sense; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers are not valid; empty if the vehicle can fly them."""
         return ""
 
 
@@ -56,7 +56,7 @@ class Land(Action, frozen=True, array_like=True, tag=3):
 
 
 class EmergencyStop(Action, frozen=True, array_like=True, tag=4):
-    """Cut the motors at once: the vehicle falls. Needs no lease."""
+    """Cut the motors at once: the vehicle falls. No lease is needed."""
 
 
 class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
@@ -64,7 +64,7 @@ class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
 
 
 class Attitude(Action, frozen=True, array_like=True, tag=6):
-    """Attitude, climb rate and yaw rate.
+    """A set-point that makes the vehicle hold an attitude while it climbs and turns.
 
     ``roll`` [rad] is positive with the right side down, ``pitch`` [rad] with the nose down (REP 103: about y, left),
     ``climb`` [m/s] upwards, ``yaw_rate`` [rad/s] counter-clockwise.
@@ -81,7 +81,7 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
 
 class Velocity(Action, frozen=True, array_like=True, tag=7):
-    """Velocity in the body's levelled axes: ``forward``, ``left``, ``up`` [m/s], ``yaw_rate`` [rad/s]."""
+    """A set-point in the body's levelled axes: velocity ``forward``, ``left``, ``up`` [m/s]; ``yaw_rate`` [rad/s]."""
 
     forward: float = 0.0
     left: float = 0.0
@@ -94,7 +94,7 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
 
 class Position(Action, frozen=True, array_like=True, tag=8):
-    """A position to fly to and hold, in the world axes of ``Feedback.position``.
+    """A set-point that flies to a position and holds it, in the world axes of ``Feedback.position``.
 
     ``x`` is east, ``y`` north, ``z`` up [m]; ``yaw`` is counter-clockwise from x [rad], or None to keep the heading.
     ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None means as fast as the limits allow.
@@ -136,7 +136,7 @@ class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
     """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or hover there.
 
     ``height`` [m] is the minimum height above the start on the way; ``land`` selects landing at the end rather than
-    hovering. For None, the proxy's parameters ``return.height`` and ``return.land`` apply.
+    hovering. If these are None, the proxy's parameters ``return.height`` and ``return.land`` apply.
     """
 
     height: float | None = None
@@ -175,15 +175,15 @@ ACTION_NAMES: dict[type[Action], str] = {
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True):
-    """One packet of the command channel.
+    """One packet of the command channel, with the action that the vehicle is to execute.
 
     A packet whose ``seq`` is not higher than all earlier ones is refused, unless it stops the motors.
     """
 
     seq: Count  #: increases with every packet of a connection
-    lease: Count  #: number of the lease it is sent under; 0 if there is none (emergency stop only)
+    lease: Count  #: number of the lease under which it is sent; 0 if there is none (emergency stop only)
     intent: Count  #: increases with each request by the *application*; the library's repeats keep it
-    sent_ns: int  #: when it was sent, on the proxy's clock; unbounded, because emergency stops are valid at any time
+    sent_ns: int  #: sending time on the proxy's clock; unchecked, because emergency stops are valid at any time
     action: AnyAction
     automatic: bool = (
         False  #: requested by the library, not by a person or a program, and so never takes a vehicle from others
@@ -199,14 +199,14 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: TimeNs
     applied_ns: TimeNs
     asked: AnyAction
-    applied: AnyAction  #: the action after the limits, as the driver applied it
+    applied: AnyAction  #: the action as limited and applied by the driver
 
 
-MAX_OUTCOME_TEXT: Final = 300  #: characters in an outcome's text
+MAX_OUTCOME_TEXT: Final = 300  #: maximum length of an outcome's text [characters]
 
 
 class Fate(StrEnum):
-    """Progress or end of an intent. A repeat never executes an intent that has ended."""
+    """What became of an intent: in progress, or how it ended. A repeat never executes an intent that has ended."""
 
     UNDER_WAY = "under_way"
     COMPLETED = "completed"
@@ -224,7 +224,7 @@ class Fate(StrEnum):
     JUMPED = "jumped"
 
 
-#: The single list of what can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
+#: The single list of everything that can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
 ENDINGS: Final[dict[Fate, str]] = {
     Fate.COMPLETED: "it was carried out",
     Fate.REFUSED: "it was refused",
@@ -243,12 +243,12 @@ ENDINGS: Final[dict[Fate, str]] = {
 
 
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """Fate of the newest intent of the application that is commanding, or was the last to do so."""
+    """Outcome of the newest intent of the application that is commanding or was the last to command."""
 
     app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
     intent: Count = 0  #: number of the intent, as in the commands for it
     fate: Fate = Fate.UNDER_WAY
-    reason: Refusal | None = None  #: why the intent or a repeat of it was refused
+    reason: Refusal | None = None  #: why the intent, or a repeat of it, was refused
     text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the reason in readable form
 
     @property
@@ -278,7 +278,7 @@ def check_pose(
     position_std_m: float | None = None,
     attitude_std_rad: float | None = None,
 ) -> None:
-    """Check the numbers of a pose: x, y, z [m]; x, y, z, w; standard deviations [m, rad], None if unknown.
+    """Check a pose: position x, y, z [m]; quaternion x, y, z, w; standard deviations [m, rad], None if unknown.
 
     Raises :class:`UsageError` if a number is missing or not finite, a standard deviation is negative, or the
     quaternion's length differs from 1 by more than 0.001.

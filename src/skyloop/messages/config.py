@@ -24,7 +24,7 @@ LOWEST_PRIORITY = 31
 
 
 class Capabilities(msgspec.Struct, frozen=True, array_like=True):
-    """A vehicle's capabilities, known before the driver opens it."""
+    """What a vehicle can do and which cameras it has; known before the driver opens it."""
 
     vehicle: str  #: the vehicle's family, e.g. ``sim`` or ``ardrone2``
     actions: frozenset[str] = frozenset()  #: names of actions that the vehicle itself supports; empty if it can't fly
@@ -48,8 +48,8 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: whether to wait in the queue if another application holds it; False: be refused at once
-    for_s: Term | None = None  #: how long it is needed after the grant [s]; nil: until it is given back
+    queue: bool = True  #: whether to queue if another application holds the authority; if False, be refused
+    for_s: Term | None = None  #: how long the application needs it after the grant [s]; nil: until it gives it back
     takeover: Takeover = Takeover.NOW
 
 
@@ -90,14 +90,14 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
     """Join the workers of a processor, or remain one: workers repeat this several times a second while they run.
 
-    The answer is :class:`Done`; the worker's share of the frames arrives as a :class:`ProcessorShare`.
+    The answer is :class:`Done`; a :class:`ProcessorShare` announces which of the frames the worker gets.
     """
 
     processor: ProcessorName
     code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: identifies the code that all workers of a processor run
     camera: Name
-    shared: bool = True  #: True: each frame goes to one worker; False: every worker gets all frames
-    ready: bool = True  #: False: this worker can't take frames at present, so they go to the others
+    shared: bool = True  #: whether each frame goes to only one worker, rather than to all of them
+    ready: bool = True  #: False: this worker can't take frames at present, so other workers get them
 
 
 class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
@@ -105,7 +105,7 @@ class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
 
     lease: Count  #: the holder's own lease
     app_id: Count  #: number of the application that asked
-    grant: bool  #: hand the authority over now; False: not yet
+    grant: bool  #: whether to hand the authority over now; False: not yet
     reason: Reason = ""  #: human-readable reason for declining
 
 
@@ -156,21 +156,21 @@ class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     """The request is queued. The grant arrives as an event and appears in feedback (``owner_id``, ``lease``)."""
 
-    position: Count  #: 1 is next
+    position: Count  #: position in the queue; 1 is next
     holder: str
     holder_priority: Priority
-    wait_s: float | None = None  #: estimated from the times that the others requested [s]; nil: unknown
-    asked: bool = False  #: whether the holder is being asked to hand it over
+    wait_s: float | None = None  #: estimated from the times for which the others requested it [s]; nil: unknown
+    asked: bool = False  #: whether the holder is being asked to hand over the authority
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A parameter, as read or after a write."""
+    """A parameter's value, as read or as it is after a write."""
 
     parameter: Parameter
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """A page of the parameters; ``total`` is the number of all of them, ``first`` the index of the page's first."""
+    """A page of the parameters; ``total`` is the number of parameters, ``first`` the index of this page's first."""
 
     total: Count
     first: Count
@@ -189,7 +189,7 @@ class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The request was refused; ``message`` gives the reason in readable form."""
+    """The request was refused; ``message`` is the reason in readable form."""
 
     code: Refusal
     message: str

@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 MAX_LINK_TEXT = 300  #: characters in a text about the vehicle link
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
-#: How ``link_reason`` begins while the vehicle is starting up: its link is connecting or up, but it can't take off yet.
+#: Prefix of ``link_reason`` while the vehicle is starting up: its link is connecting or up, but it can't take off yet.
 WAKING_UP = "still waking up"
 
 NO_POSITION = "the vehicle does not report its position"
-#: How to give a vehicle its position, as advice to someone whose vehicle has none.
+#: Ways to give a vehicle its position, as advice to users whose vehicle has none.
 POSITION_SOURCES = (
     "make it available: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
     "GPS, optical flow or motion capture (docs/motion-capture.md)"
@@ -52,7 +52,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     counter-clockwise from x (ROS REP 103).
     """
 
-    captured_ns: TimeNs  #: time of this state, on the proxy's clock
+    captured_ns: TimeNs  #: time at which the vehicle was in this state, on the proxy's clock
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: remaining charge, 0 to 1
     battery_v: Finite | None = None  #: voltage of the battery [V]
@@ -66,7 +66,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     position_m: Vector | None = None  #: position in world axes [m], if the vehicle knows it
     native: dict[str, Value] | None = None  #: the vehicle's own telemetry, with its own names and units
 
-    seq: Count = 0  #: increases by one with each sample during a run of the proxy
+    seq: Count = 0  #: increases by one with each sample while the proxy runs
     published_ns: TimeNs = 0  #: when the proxy published the sample
     vehicle_link: LinkState = LinkState.CONNECTING  #: state of the hop from proxy to vehicle
     owner: str | None = None  #: name of the application that holds the authority
@@ -76,16 +76,16 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     failsafe: Failsafe = Failsafe.NONE
     link_reason: LinkText = ""  #: why the vehicle link is in this state; while it is up, see :attr:`waking_up`
     link_remedy: LinkText = ""  #: what a person can do about it
-    others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller is flying it
     start_position_m: Vector | None = None  #: position of the last take-off in world axes [m]; None: unknown
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
-    skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
-    outcome: Outcome | None = None  #: fate of the newest intent; None: the proxy does not report it
-    next_owner: str | None = None  #: name of the first in the queue for the authority; None: the queue is empty
+    skipped: Count = 0  #: number of samples before this one that the proxy skipped for a subscriber with a lower rate
+    outcome: Outcome | None = None  #: result of the newest intent; None: the proxy does not report it
+    next_owner: str | None = None  #: name of the first application in the queue for the authority; None if it is empty
 
     @property
     def waking_up(self) -> bool:
-        """Whether the vehicle has just started and can't take off yet; ``link_reason`` says what it waits for."""
+        """Whether the vehicle has just started and can't take off yet; ``link_reason`` says what it is waiting for."""
         return self.link_reason.startswith(WAKING_UP)
 
     @property
@@ -112,8 +112,8 @@ _KEYS: Final = ("origin.latitude_deg", "origin.longitude_deg", "origin.altitude_
 class EarthOrigin(NamedTuple):
     """The geographic position of the origin of ``Feedback.position_m``, whose axes are x east and y north.
 
-    Autopilots project the earth onto their axes as a sphere. Conversions here use the vehicle's own sphere, so that
-    both agree; with a different sphere, positions would be off by up to 0.6 % of their distance.
+    Autopilots project the earth onto their axes as a sphere. Conversions here use the vehicle's own sphere so that both
+    agree; with a different one, positions would be off by up to 0.6 % of their distance from the origin.
     """
 
     latitude_deg: float  #: latitude [°], north positive
@@ -123,7 +123,7 @@ class EarthOrigin(NamedTuple):
 
     @classmethod
     def of(cls, native: Mapping[str, object] | None) -> EarthOrigin | None:
-        """Return the origin from a driver's ``Feedback.native``; None if there is none or it makes no sense."""
+        """Return the origin from a driver's ``Feedback.native``; None if it is missing or its values are invalid."""
         found = [native.get(key) if native else None for key in _KEYS]
         numbers = [float(one) for one in found if isinstance(one, int | float) and math.isfinite(one)]
         if len(numbers) < len(_KEYS) or not (is_on_earth(*numbers[:2]) and numbers[3] > 0.0):
@@ -137,8 +137,8 @@ class EarthOrigin(NamedTuple):
     def position_of(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
         """Return a geographic position in world axes: x east, y north, z up [m].
 
-        Latitude [°] is positive north, longitude [°] east, by the shorter way around the earth; the altitude [m] is
-        above mean sea level.
+        Latitude is positive north [°], and longitude east [°], taking the shorter way around the earth; the altitude
+        [m] is above mean sea level.
         """
         east_rad = math.radians(math.remainder(longitude_deg - self.longitude_deg, 360.0))
         middle_rad = math.radians((latitude_deg + self.latitude_deg) / 2.0)
@@ -160,13 +160,13 @@ def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True):
-    """One event: ``text`` is for people to read, ``kind`` and ``data`` are for programs."""
+    """Something that happened, and why: ``text`` is for people to read, ``kind`` and ``data`` are for programs."""
 
     kind: EventKind
     text: str
     at_ns: TimeNs  #: time of the event, on the proxy's clock
     severity: Severity = Severity.INFO
-    seq: Count = 0  #: increases by one with each event during a run of the proxy; 0 for the client's own events
+    seq: Count = 0  #: increases by one with each event while the proxy runs; 0 for the client's own events
     app: str | None = None  #: name of the application concerned
     data: dict[str, Value] = msgspec.field(default_factory=dict)
 
@@ -176,12 +176,12 @@ MAX_EVENT_TEXT: Final = 200  #: characters in the last event's text
 
 
 class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
-    """One vehicle's summary. Unknown values are ``None``, as in :class:`Feedback`."""
+    """A summary of one vehicle. Unknown values are ``None``, as in :class:`Feedback`."""
 
     name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of its proxy
     uri: Annotated[str, msgspec.Meta(max_length=MAX_ADDRESS)] = ""  #: the vehicle's address, truncated if longer
     vehicle: Annotated[str, msgspec.Meta(max_length=64)] = ""  #: the vehicle's family
-    can_fly: bool = False  #: whether it accepts commands at all
+    can_fly: bool = False  #: whether the vehicle accepts commands at all
     captured_ns: TimeNs = 0  #: capture time of its newest feedback, on the proxy's clock; 0 if there is none yet
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: remaining charge, 0 to 1
@@ -197,7 +197,7 @@ class VehicleOverview(msgspec.Struct, frozen=True, array_like=True, kw_only=True
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone, which another controller is flying
     return_phase: ReturnPhase = ReturnPhase.NONE
     applications: Count = 0  #: number of connected applications
-    event: Event | None = None  #: the last event, without data; connecting and disconnecting applications don't count
+    event: Event | None = None  #: the last event, without data; applications that connect or disconnect don't count
 
 
 class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
@@ -209,7 +209,7 @@ class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     at_ns: TimeNs  #: time of the overview, on the proxy's clock
     seq: Count  #: increases by one with each overview
     first: Count = 0  #: index of the first row on this page
-    total: Count = 0  #: number of rows on all pages
+    total: Count = 0  #: number of rows on all pages together
     vehicles: tuple[VehicleOverview, ...] = ()
 
 
@@ -221,9 +221,9 @@ class OverviewPages:
         self._rows: list[VehicleOverview] = []
 
     def add(self, page: Overview) -> Overview | None:
-        """Add a page; return the whole overview if this was its last page, else None.
+        """Add a page; return the whole overview if this was its last missing page, otherwise None.
 
-        An overview with a missing page is dropped: the next one follows within a second.
+        An overview with a missing page is dropped, because the next one follows within a second.
         """
         if page.first == 0:
             self._seq, self._rows = page.seq, []
@@ -238,7 +238,7 @@ class OverviewPages:
 
 
 def typical_feedback(captured_ns: int, state: FlightState = FlightState.FLYING) -> Feedback:
-    """Return feedback with as many values as from a real vehicle, for benchmarks."""
+    """Return feedback with as many values as a real vehicle sends, for benchmarks."""
     return Feedback(
         captured_ns=captured_ns,
         state=state,

@@ -1,8 +1,8 @@
 """Types of the fields of samples: bounded numbers and closed vocabularies.
 
 Samples may come from any program that can connect, and their numbers are used as sizes, indices, times and loop bounds.
-Therefore numbers are bounded here, once, on arrival, rather than wherever they are used. Each member of a vocabulary
-equals its own string, so ``state == "hovering"`` works.
+Therefore numbers are bounded here, once, on arrival, rather than wherever they are used. Each enumeration member equals
+its string, so ``state == "hovering"`` works.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Annotated, Final
 
 import msgspec
 
-#: A counter: a sequence number, a lease, an application's number. Python's ints are unbounded, others' have 64 bits.
+#: A counter: sequence number, lease or application number. Python's ints are unbounded; other languages use 64 bits.
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
-#: Latest time, 73 years: no monotonic clock reaches it, and the sum of a time, an offset between two clocks and the
-#: Unix time of their start still fits into 64 bits.
+#: The latest time, after 73 years. No monotonic clock reaches it, and the sum of a time, an offset between two clocks
+#: and the Unix time of their start still fits into 64 bits.
 LATEST_NS: Final = 2**61
 #: A time on a monotonic clock [ns].
 TimeNs = Annotated[int, msgspec.Meta(ge=-LATEST_NS, le=LATEST_NS)]
@@ -29,7 +29,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 
-#: Three finite numbers, along x, y and z.
+#: Three finite numbers: the components along x, y and z.
 Vector = tuple[Finite, Finite, Finite]
 #: A value of native telemetry, of a parameter or of an event's data.
 Value = bool | int | float | str | tuple[float, ...]
@@ -38,8 +38,8 @@ Value = bool | int | float | str | tuple[float, ...]
 def shape_fits(shape: Sequence[int], count: int, most: int) -> bool:
     """Return whether an array of this shape has ``count`` elements and its axes are not excessively long.
 
-    A zero makes the product of the lengths 0, however large the others are, and a loop over those would never end.
-    Therefore the product with each 0 counted as 1 is at most ``most``.
+    If one length is 0, so is the product of all lengths, however large the others are, and a loop over those would
+    never end. Therefore the product with each 0 counted as 1 is at most ``most``.
     """
     return math.prod(shape) == count and math.prod(max(1, length) for length in shape) <= most
 
@@ -70,20 +70,20 @@ class LinkState(StrEnum):
     CONNECTING = "connecting"  #: first attempt in progress, nothing received yet
     UP = "up"
     DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
-    LOST = "lost"  #: nothing received past the threshold; reconnecting automatically
-    CLOSED = "closed"  #: closed deliberately; nothing more will arrive
+    LOST = "lost"  #: nothing received for too long; reconnecting automatically
+    CLOSED = "closed"  #: closed on purpose; nothing more will arrive
 
 
 class Failsafe(StrEnum):
     """The active step of the failsafe ladder."""
 
     NONE = "none"
-    HOVER = "hover"  #: holding the position because the pilot is silent or gone
-    LAND = "land"  #: landing because there is still no pilot, or the battery is low
+    HOVER = "hover"  #: holding the position because the pilot has gone or is sending nothing
+    LAND = "land"  #: landing because there is still no pilot or because the battery is low
 
 
 class ReturnPhase(StrEnum):
-    """A vehicle's progress on its return to where it took off."""
+    """A vehicle's progress on its return flight."""
 
     NONE = "none"  #: not returning
     CLIMBING = "climbing"  #: climbing to the height of the return flight
@@ -96,7 +96,7 @@ class Encoding(StrEnum):
     """The format of a frame's bytes."""
 
     BGR8 = "bgr8"  #: height × width × 3 bytes, blue first (OpenCV's order), rows without padding
-    RGB8 = "rgb8"  #: the same with red first
+    RGB8 = "rgb8"  #: like ``BGR8``, but red first
     MONO8 = "mono8"  #: height × width bytes
     JPEG = "jpeg"  #: one JPEG file
 
@@ -114,7 +114,7 @@ class Role(StrEnum):
 class Takeover(StrEnum):
     """How a request for the authority displaces a holder of lower priority."""
 
-    NOW = "now"  #: takes it at once
+    NOW = "now"  #: takes the authority at once
     ASK = "ask"  #: asks the holder first; after a while the higher priority wins
 
 
@@ -132,29 +132,29 @@ class EventKind(StrEnum):
     APPLICATION_LINK = "application_link"  #: the link from application to proxy changed; data: state, reason
     VEHICLE_LINK = "vehicle_link"  #: the link from proxy to vehicle or its reason changed; data: state, reason, remedy
     AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease, identity; until_ns if limited
-    AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
+    AUTHORITY_QUEUED = "authority_queued"  #: queued, or moved up; data: app_id, priority, position; wait_s if known
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
     AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
     AUTHORITY_ASKED = "authority_asked"  #: a request to the holder; data: app_id, lease, by, by_id, by_priority …
     AUTHORITY_DECLINED = "authority_declined"  #: data: app_id (the requester), by (the holder), reason
     AUTHORITY_WITHDRAWN = "authority_withdrawn"  #: the requester gave up; data: app_id (the holder), lease, by, by_id
-    AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and the queue is empty; data: app_id, lease
+    AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time has run out and nobody is queued; data: app_id, lease
     FAILSAFE = "failsafe"  #: a step of the ladder began or ended; data: step, reason
     COMMAND_REFUSED = "command_refused"  #: data: reason (a Refusal), seq, count
     COMMAND_CLAMPED = "command_clamped"  #: a set-point exceeded a limit; data: limit, asked, applied
     PACKET_MALFORMED = "packet_malformed"  #: data: reason, count
-    STATE_CHANGED = "state_changed"  #: flight state; data: before, after
+    STATE_CHANGED = "state_changed"  #: the flight state has changed; data: before, after
     BATTERY_LOW = "battery_low"  #: data: battery
     EMERGENCY = "emergency"  #: motors cut; data: reason
     PARAMETER_CHANGED = "parameter_changed"  #: data: name, value, app_id (who wrote it)
-    DRIVER_ERROR = "driver_error"  #: a call of the driver failed; data: where
+    DRIVER_ERROR = "driver_error"  #: a call to the driver failed; data: where
     COLLISION = "collision"  #: a simulated vehicle touched something; data: speed_m_s
     VEHICLE_MESSAGE = "vehicle_message"  #: text from the vehicle itself
     SAMPLES_LOST = "samples_lost"  #: a slow application missed events; data: count
     CALLBACK_ERROR = "callback_error"  #: an application's own callback or processor raised; data: where
-    RECORDING = "recording"  #: a recorder started, ended, dropped samples or can't write; data: state, path
+    RECORDING = "recording"  #: recording started, ended, lost samples or can't be written; data: state, path
     PROCESSOR = "processor"  #: a worker joined, left, or paused; data: processor, state, app_id
-    KEYS = "keys"  #: a key of the network expires within a week, or the roster has changed
+    KEYS = "keys"  #: a network key expires within a week, or the roster has changed
     PROXY_CLOSING = "proxy_closing"  #: the proxy is shutting down deliberately
 
 
@@ -167,7 +167,7 @@ class Refusal(StrEnum):
     NO_AUTHORITY = "no_authority"  #: the sender holds no lease
     FOREIGN_LEASE = "foreign_lease"  #: the given lease is not the one in force
     NON_FINITE = "non_finite"  #: NaN or infinite
-    NOT_FRESH = "not_fresh"  #: repeats an intent older than a failsafe or a loss of the vehicle link
+    NOT_FRESH = "not_fresh"  #: repeats an intent from before a failsafe or a loss of the vehicle link
     VEHICLE_LINK_LOST = "vehicle_link_lost"
     UNSUPPORTED = "unsupported"  #: neither the vehicle nor the software autopilot supports it
     WRONG_STATE = "wrong_state"  #: not possible in the present flight state
@@ -178,5 +178,5 @@ class Refusal(StrEnum):
     READ_ONLY = "read_only"
     DRIVER_FAILED = "driver_failed"
     BUSY = "busy"  #: an application with at least the same priority holds the authority
-    NAME_TAKEN = "name_taken"  #: the name is in use by other code, or for another way of sharing
+    NAME_TAKEN = "name_taken"  #: the name is in use by other code, or with a different setting of ``shared``
     PROTOCOL = "protocol"  #: a request out of order, or of another protocol version

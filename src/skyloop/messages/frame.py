@@ -1,6 +1,6 @@
-"""Video samples: frame headers and the encoded pictures of streams; also, the size of image files.
+"""Video samples: frame headers and the encoded frames of streams; also functions for the size of image files.
 
-A stream holds pictures as the vehicle sent them, or as the proxy encoded them. It runs only while it has subscribers.
+A stream holds frames as encoded by the vehicle or by the proxy. It runs only while it has subscribers.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-H264: Final = "h264"  #: the only codec that is recorded without decoding
-#: Maximum number of a picture's bytes in one packet, which also holds the other fields.
+H264: Final = "h264"  #: the only codec recorded without being decoded
+#: Maximum number of bytes of a frame in one packet, which also holds the other fields.
 MAX_PIECE: Final = 57_000
 MAX_PIECES: Final = 64
-MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a whole picture [bytes]
+MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a complete frame [bytes]
 Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
@@ -45,7 +45,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
-    """Header of one frame; the pixels are sent separately."""
+    """Header of one frame, whose pixels are sent separately."""
 
     camera: Name
     seq: Count  #: increases by one with each frame of this camera, including dropped ones
@@ -70,33 +70,33 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
     position_m: tuple[Finite, Finite, Finite] | None = None  #: position of the optical centre in body axes [m]
-    stream: str = ""  #: codec in which pictures are available undecoded, ``h264``; empty if there are only frames
+    stream: str = ""  #: codec of frames available without decoding, ``h264``; empty if there are none
 
 
 class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
-    """One picture; for H.264, an access unit in Annex B format, with its parameter sets if it is a key picture.
+    """An encoded frame; for H.264, an access unit in Annex B format, with parameter sets if it is a key frame.
 
-    A picture larger than a packet is sent in pieces, each an ``EncodedFrame``. Every picture except a key picture
-    refers to the previous one, so after a gap in ``seq`` nothing can be decoded before the next key picture. No picture
-    refers to a later one. A frame decoded from it has the same ``captured_ns``, and a ``seq`` of its own.
+    A frame larger than a packet is sent in pieces, each an ``EncodedFrame``. Every frame except a key frame refers to
+    the previous one, so after a gap in ``seq`` nothing can be decoded before the next key frame. Frames never refer to
+    later ones. A frame decoded from it has the same ``captured_ns`` but its own ``seq``.
     """
 
     camera: Name
-    seq: Count  #: increases by one with each picture of the stream, including those larger than a packet
-    captured_ns: TimeNs  #: the same as in the decoded frame
+    seq: Count  #: number of the frame in the stream, which also counts frames too large for a packet
+    captured_ns: TimeNs  #: capture time, the same as that of the decoded frame
     published_ns: TimeNs  #: when the proxy received it
-    width: Pixels  #: width of the decoded picture
+    width: Pixels  #: width of the decoded frame
     height: Pixels
     codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
-    key: bool  #: whether it can be decoded without earlier pictures
+    key: bool  #: whether it can be decoded without earlier frames
     data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: one packet holds at most :data:`MAX_PIECE` bytes
     intrinsics: Intrinsics | None = None
-    topic: Topic = ""  #: topic of the picture; empty: ``stream/CAMERA``, as the vehicle encoded it
+    topic: Topic = ""  #: topic of the frame; empty: ``stream/CAMERA``, as encoded by the vehicle
     piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
     pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
 
     def decoded(self, width: int, height: int) -> FrameHeader:
-        """Return the header of the frame decoded from this picture, a BGR image of this size [px]."""
+        """Return the header of the frame decoded from this one, a BGR image of this size [px]."""
         same = (width, height) == (self.width, self.height)
         times = (self.captured_ns, self.published_ns)
         lens = self.intrinsics if same else None  # the intrinsics are valid for the announced size
@@ -104,15 +104,15 @@ class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class StreamReport(msgspec.Struct, frozen=True, array_like=True):
-    """A subscriber's report on a stream that the proxy encodes. If it is lost, the next one makes up for it."""
+    """A subscriber's report on a stream that the proxy encodes. If a report is lost, the next one makes up for it."""
 
     topic: Topic
-    seq: Count  #: number of the newest picture received whole; 0 if there is none yet
-    wants_key: bool = False  #: whether the subscriber can decode nothing before the next key picture
+    seq: Count  #: number of the newest frame received completely; 0 if there is none yet
+    wants_key: bool = False  #: whether the subscriber can't decode anything until the next key frame
 
 
 def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
-    """Yield the pieces of a whole picture in order, or the picture itself if it fits into a packet."""
+    """Yield the pieces of a frame in order, or the frame itself if it fits into a packet."""
     pieces = -(-len(picture.data) // MAX_PIECE)
     if pieces <= 1:
         yield picture
@@ -123,13 +123,13 @@ def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
 
 
 class Pieces:
-    """Reassembles the pictures of one stream. A picture whose pieces arrive out of order is dropped."""
+    """Reassembles the frames of one stream. A frame whose pieces arrive out of order is dropped."""
 
     def __init__(self) -> None:
         self._parts: list[EncodedFrame] = []
 
     def add(self, part: EncodedFrame) -> EncodedFrame | None:
-        """Add a piece; return the picture if this completes it."""
+        """Add a piece; return the frame if this completes it."""
         if part.pieces == 1:
             self._parts.clear()
             return part
@@ -148,13 +148,13 @@ class Pieces:
 
 
 class Chain:
-    """Decides which pictures of a stream are decodable: key pictures, and those that follow without a gap."""
+    """Decides which frames of a stream are decodable: key frames, and those that follow without a gap."""
 
     def __init__(self) -> None:
-        self._last: int | None = None  # None while waiting for a key picture
+        self._last: int | None = None  # None while waiting for a key frame
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Return whether the next picture received, with this ``seq``, can be decoded; False for duplicates."""
+        """Return whether the next frame received, numbered ``seq``, can be decoded; False for duplicates."""
         if number == self._last and not key:
             return False
         whole = key or (self._last is not None and number == self._last + 1)
@@ -162,16 +162,16 @@ class Chain:
         return whole
 
     def restart(self) -> None:
-        """Start over, because the next picture does not continue the previous ones."""
+        """Start over, because the next frame does not continue the previous ones."""
         self._last = None
 
 
 # The size is read from a JPEG's or PNG's header before decoding: decoders reserve memory for the announced size, so a
 # file of a few kilobytes could claim gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
 
-#: Maximum size of a picture to decode: 8K UHD (100 MB as BGR), far more than any small drone's camera has.
+#: Maximum size of an image to decode: 8K UHD (100 MB as BGR), far more than any small drone's camera has.
 MAX_PIXELS: Final = 7680 * 4320
-#: Maximum number of scans in a progressive JPEG, each of which covers the whole picture; encoders make about ten.
+#: Maximum number of scans in a progressive JPEG, each of which covers the whole image; encoders make about ten.
 MAX_SCANS: Final = 100
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -179,7 +179,7 @@ _JPEG: Final = b"\xff\xd8"
 _SCAN: Final = b"\xff\xda"
 _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD8)})
-_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: markers that end a header: a second start, the end, or the first scan
+_ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: markers that end a header: another start, the end, or a scan
 
 
 def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
@@ -195,7 +195,7 @@ def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
 
 
 def why_not_decoded(data: bytes | memoryview) -> str:
-    """Return why a picture must not be decoded; empty if it may."""
+    """Return why an image must not be decoded; empty if it may be decoded."""
     size = image_size(data)
     if size is None:
         return "it is neither JPEG nor PNG, or it is damaged"
@@ -210,7 +210,7 @@ def why_not_decoded(data: bytes | memoryview) -> str:
 def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
     at = 2
     while at + 4 <= len(data):
-        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, and bytes that decoders skip
+        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, or bytes that decoders skip
             at += 1
             continue
         marker = data[at + 1]

@@ -1,6 +1,6 @@
 """Pure functions for bounded numbers, angles, rotation matrices and quaternions, in the axes of ROS REP 103.
 
-Limits never let NaN through: it counts as 0, or as the number nearest to 0 within the range.
+Limits never pass NaN through: they treat it as 0 or, if 0 is out of range, as the limit closest to 0.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def wrap_angle(angle: _Angle) -> _Angle:
 
 
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:
-    """Rotate a vector counter-clockwise [rad]; if the angle is the yaw, from levelled body axes to world axes."""
+    """Rotate a vector by an angle, counter-clockwise [rad]; the yaw turns levelled body axes into world axes."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos * x - sin * y, sin * x + cos * y
 

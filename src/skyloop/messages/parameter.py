@@ -1,4 +1,4 @@
-"""Parameters, two of which are read-only and hold structured text: a vehicle's checkup, and its world.
+"""Parameters, two of which are read-only and hold structured text: a vehicle's checkup and its world.
 
 A parameter has a type, a unit, a range and a default, so that both people and web pages can edit it.
 """
@@ -58,14 +58,14 @@ class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
     good: bool  #: whether the result is good
     detail: _Text  #: the result
     advice: _Text = ""  #: what to do about it; empty if there is nothing to do
-    severe: bool = False  #: whether it is dangerous or sure to fail, rather than just a disabled safety net
+    severe: bool = False  #: whether it is dangerous or sure to fail, not just a disabled safety net
 
 
 _checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
 
 
 def encode_checkup(diagnostics: list[Diagnostic]) -> str:
-    """Encode diagnostics as a parameter's text; if it gets too long, leave out good ones first."""
+    """Encode diagnostics as a parameter's text; if it gets too long, drop good ones first."""
     kept = list(diagnostics)
     while len(text := _encode_json(kept).decode()) > MAX_CHECKUP_TEXT:
         kept.remove(next((one for one in reversed(kept) if one.good), kept[-1]))
@@ -73,13 +73,13 @@ def encode_checkup(diagnostics: list[Diagnostic]) -> str:
 
 
 def decode_checkup(text: str) -> list[Diagnostic]:
-    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if it holds none."""
+    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if the text does not contain any."""
     return _checkup_decoder.decode(text.encode())
 
 
-# A vehicle's world, for maps: walls, solids, gates, markers, starts; published by drivers that know their surroundings.
-# World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east, counter-clockwise [rad].
-# It is for display only, never for control.
+# The world around a vehicle, for maps: walls, solids, gates, markers, starts. Drivers that know their surroundings
+# publish it. World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east,
+# counter-clockwise [rad]. It is for display only, never for control.
 
 WORLD: Final = "world.geometry"  #: the parameter's name
 MAX_WORLD_TEXT: Final = 8000  #: characters in the text, so that it fits into a parameter's packet
@@ -119,7 +119,7 @@ class Card(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Start(msgspec.Struct, frozen=True, array_like=True):
-    """Where a vehicle starts: its position and heading."""
+    """The position and heading at which a vehicle starts."""
 
     name: _Name
     position: _Vec
@@ -137,14 +137,14 @@ class WorldGeometry(msgspec.Struct, frozen=True):
     gates: Annotated[tuple[Opening, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     markers: Annotated[tuple[Card, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     starts: Annotated[tuple[Start, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
-    left_out: int = 0  #: number of objects left out because the text has no room for them
+    left_out: int = 0  #: number of objects omitted for lack of space in the text
 
 
 _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Encode a world as a parameter's text; if it gets too long, leave out the last solids and markers."""
+    """Encode a world as a parameter's text; if it gets too long, omit the last solids and markers."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)
@@ -155,5 +155,5 @@ def encode_world(world: WorldGeometry) -> str:
 
 
 def decode_world(text: str) -> WorldGeometry:
-    """Decode the world in a parameter's text. Raises ``ValueError`` if it is none."""
+    """Decode the world in a parameter's text. Raises ``ValueError`` if the text does not describe a world."""
     return _world_decoder.decode(text.encode())

@@ -15,8 +15,7 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: drawings by a controller or processor on a frame, for people and recorders; the newest wins. Coordinates
-# are in pixels of that frame.
+# Annotations: drawings by a controller or processor on a frame; the newest wins. Coordinates are in frame pixels.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -25,7 +24,7 @@ GREEN: Colour = (64, 220, 100)
 
 
 class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """A line through points; if closed, a polygon (a box has four points)."""
+    """A line through points to draw on a frame; if closed, a polygon (a box has four points)."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=512)]
     closed: bool = False
@@ -33,14 +32,14 @@ class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Points(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """Single points."""
+    """Single points to draw on a frame."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=1024)]
     colour: Colour = GREEN
 
 
 class Text(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """A text next to a point."""
+    """A text to draw next to a point on a frame."""
 
     text: Annotated[str, msgspec.Meta(max_length=256)]
     at: Point
@@ -51,7 +50,9 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
-    source: Name  #: the tracker or controller that drew it; for each source and camera, only the newest counts
+    """Shapes that a tracker or controller draws over a frame, for people and recorders."""
+
+    source: Name  #: tracker or controller that drew it; only the newest annotation per source and camera is valid
     camera: Name
     captured_ns: TimeNs  #: capture time of the annotated frame
     width: Pixels  #: width of that frame
@@ -69,13 +70,13 @@ MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):
-    """One entry, which has exactly one of ``text``, ``number`` and ``values``.
+    """A log entry, which has exactly one of ``text``, ``number`` and ``values``.
 
     Raises ``ValueError`` if it has none or several of them, or if the shape does not match the values.
     """
 
-    source: Name  #: the application, or the part of it, that logged the entry
-    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text outside any series
+    source: Name  #: the application that logged the entry, or a part of it
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text that belongs to no series
     at_ns: TimeNs  #: when it was logged, on the proxy's clock
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
@@ -93,9 +94,9 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 # Results: a processor's output for one frame, and how a processor's workers share the frames.
 
-MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
+MAX_PAYLOAD: Final = 32_768  #: maximum size of a packed result [bytes]
 MAX_CODE: Final = 128  #: characters that identify a processor's code
-MAX_PARTS: Final = 1024  #: maximum number of shares of a camera's frames, one per worker
+MAX_PARTS: Final = 1024  #: maximum number of parts into which a camera's frames are divided, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
 
@@ -108,7 +109,7 @@ class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
     seq: Count  #: number of the frame
     captured_ns: TimeNs  #: capture time of the frame
     made_ns: TimeNs  #: when the result was ready, on the proxy's clock
-    took_ns: Count  #: duration of the worker's ``process`` [ns]
+    took_ns: Count  #: how long the worker's ``process`` took [ns]
     number: Count  #: increases by one with each result of a worker
     payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
     worker: Count = 0  #: number of the sending application; the proxy overwrites it
@@ -119,10 +120,10 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 
     processor: ProcessorName
     camera: Name
-    part: Count  #: number of the share, from 0
-    #: number of shares; 1: every frame; 0: no frames, because the worker reported that it can't take any
+    part: Count  #: number of this worker's part of the frames, from 0
+    #: number of parts; 1: every frame; 0: no frames, because the worker reported that it can't take any
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
-    workers: Count  #: number of workers for this processor and camera, including paused ones
+    workers: Count  #: number of workers for this processor and camera, including those that are paused
 
     def __post_init__(self) -> None:
         if self.part >= max(1, self.parts):
@@ -135,7 +136,7 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 
 ARRAY: Final = 1  #: the extension type of arrays
 MAX_DIMENSIONS: Final = 8
-MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that walking a value needs a bounded stack
+MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that a bounded stack suffices to traverse a value
 #: Allowed element types of arrays: those that are the same on every machine.
 DTYPES: Final = (
     "bool",
@@ -249,5 +250,5 @@ def _decode_extension(code: int, data: memoryview) -> Any:
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
 _decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
-_plain_decoder = msgspec.msgpack.Decoder()  # leaves arrays of numbers as bytes
+_plain_decoder = msgspec.msgpack.Decoder()  # does not convert arrays of numbers, which stay bytes
 _array_decoder = msgspec.msgpack.Decoder(_Array)

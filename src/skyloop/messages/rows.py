@@ -10,9 +10,9 @@ from skyloop.messages.command import Attitude, Velocity
 from skyloop.messages.feedback import Feedback
 
 _VELOCITY: Final = ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s")
-#: Names of the numbers in a drone's own state, which have the axes and units of :class:`Feedback`.
+#: Names of the numbers in a drone's own state, with the axes and units of :class:`Feedback`.
 STATE: Final = ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m", *_VELOCITY)
-#: Names of the numbers in an application's set-points, by the set-point's name.
+#: Names of the numbers in an application's set-points, by the name of the set-point.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
     "attitude": ("roll", "pitch", "climb", "yaw_rate"),
@@ -20,7 +20,7 @@ ACTIONS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
-    """Return the numbers of these names, from :data:`STATE`, in a drone's state; None if any is unknown.
+    """Return the numbers with these names (from :data:`STATE`) in a drone's state; None if any of them is unknown.
 
     Raises :class:`UnknownNameError` for a name that is not in :data:`STATE`.
     """

@@ -1,4 +1,4 @@
-"""Subscribers' requests: the rate of feedback, and the camera, form and rate of video. Pure.
+"""Subscribers' requests: the rate of feedback; the camera, encoding and rate of video. Pure.
 
 Each request has exactly one topic, so equal requests are encoded once for all their subscribers.
 """
@@ -16,17 +16,17 @@ from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
-MIN_HZ: Final = 0.001  #: lowest rate, one sample in a quarter of an hour, so that the period stays finite
+MIN_HZ: Final = 0.001  #: lowest rate, one sample every quarter of an hour, which keeps the period finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
-TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be early
+TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be too early
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
 MIN_KBIT_S: Final = 30  #: lowest rate of a stream that the proxy encodes
 MAX_KBIT_S: Final = 50_000
 MAX_SUBSCRIBER: Final = 32  #: characters in a subscriber's name
-MIN_FPS: Final = 0.001  #: lowest rate, one frame in a quarter of an hour, so that the period stays finite
+MIN_FPS: Final = 0.001  #: lowest rate, one frame every quarter of an hour, which keeps the period finite
 _ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
 _STREAM_PREFIX: Final = "stream/"
@@ -48,7 +48,7 @@ class FeedbackRequest:
             known = isinstance(rate, int | float) and not isinstance(rate, bool)
             if not (known and MIN_HZ <= rate <= MAX_HZ):
                 raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
-            # Round the rate as in a topic, so that the requests at both ends are equal.
+            # Round the rate as in the topic's name, so that both ends have the same request.
             object.__setattr__(self, "max_hz", float(f"{rate:g}"))
 
     @property
@@ -58,7 +58,7 @@ class FeedbackRequest:
 
     @property
     def topic(self) -> str:
-        """The topic to subscribe to: ``feedback``, or for example ``feedback?max_hz=5``."""
+        """The topic to subscribe to: ``feedback`` or, if the rate is limited, for example ``feedback?max_hz=5``."""
         return FEEDBACK if self.max_hz is None else f"{_FEEDBACK_RATE}{self.max_hz:g}"
 
     @property
@@ -96,7 +96,7 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """One consumer's request for a camera's frames; H.264 has its own topic, :attr:`stream_topic`.
+    """One consumer's request for a camera's frames; H.264 streams have a separate topic, :attr:`stream_topic`.
 
     Requests for the same frames are equal and have the same :attr:`topic`. Raises :class:`UsageError` for invalid
     values.
@@ -108,8 +108,8 @@ class VideoRequest:
     max_fps: float | None = None  #: maximum number of frames a second; None: all
     scale: float = 1.0  #: factor for width and height, greater than 0 and at most 1
     part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n is k
-    kbit_s: int | None = None  #: average H.264 rate; None: as the vehicle sent it, or as much as the path can carry
-    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to its path
+    kbit_s: int | None = None  #: average H.264 rate; None: as sent by the vehicle, or as much as the path can carry
+    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to the path to it
 
     def __post_init__(self) -> None:
         if not self.camera:
@@ -128,7 +128,7 @@ class VideoRequest:
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         self._check_stream()
         if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; by this, equivalent requests are equal
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; the same in all equivalent requests
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
@@ -175,7 +175,7 @@ class VideoRequest:
     def stream_topic(self) -> str:
         """The topic of the request's H.264, e.g. ``stream/front?kbit_s=500``.
 
-        Without options, it is the vehicle's own stream.
+        Without options, this is the vehicle's own stream.
         """
         variant = self._variant("")
         return f"{_STREAM_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
@@ -187,7 +187,7 @@ class VideoRequest:
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """Parse a video topic. Raises :class:`UsageError` for any other."""
+        """Parse a video topic. Raises :class:`UsageError` for any other topic."""
         prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
         camera, _, variant = topic.removeprefix(prefix).partition("?")
         if not topic.startswith(prefix) or not camera:
@@ -222,13 +222,13 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Reduces one series of samples to an average rate.
+    """Thins a series of samples to an average rate.
 
     It keeps state, so each series and each consumer needs its own.
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Keep the first sample that arrives. None: keep all samples."""
+        """Create a limiter, which keeps the first sample to arrive. None: keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
@@ -244,7 +244,7 @@ class RateLimiter:
     def in_time(self, at_ns: int) -> bool:
         """Return whether to keep a sample. Call it once for each sample, in order.
 
-        Its time [ns] may be on any clock as long as it is always the same.
+        Its time [ns] may be on any clock, but must always be on the same one.
         """
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
