@@ -1,4 +1,4 @@
-"""Build wheel and source package, check them, and fly the demo from the installed wheel.
+"""Build wheel and source package, check them, and fly the demo from the installed wheel, with and without its page.
 
     python scripts/package_check.py            # as in `make package` and .ci/run
     python scripts/package_check.py --keep-in build/package --seconds 20
@@ -25,6 +25,13 @@ ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6")
 #: Also installed by `make demo`.
 EXTRAS = ("sim", "vision", "cockpit")
+#: Ends without an error only if the cockpit starts with these extras and serves its page.
+PAGE = """
+import urllib.request
+from skyloop.cockpit.child import CockpitProcess
+with CockpitProcess(port=0) as page:
+    assert b"<title>" in urllib.request.urlopen(page.address(), timeout=60).read()
+"""
 #: In the wheel beside the modules, and otherwise missed only when used.
 NEEDED = (
     "skyloop/py.typed",
@@ -66,6 +73,8 @@ def main() -> None:
         home.mkdir()
         command = ("skyloop", "demo", "--headless", "--seconds", f"{options.seconds:g}")
         run(python.parent / command[0], *command[1:], cwd=home)
+        step("its page is served there")
+        run(python, "-c", PAGE, cwd=home)
     print("ok: built, checked, installed and flown", flush=True)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.recording import Recorder, record
-from skyloop.recording.reader import Described, describe
+from skyloop.recording.listing import Described, describe
 from tests.support.cockpit import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
 from tests.support.testclient import TestClient, WebSocketTestSession
 
@@ -233,3 +235,9 @@ def test_files_are_inspected_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     asyncio.run(main())
     assert sorted(looked) == ["a.mcap", "a.mcap", "b.mcap"]
+
+
+def test_the_page_starts_without_the_extra_for_recordings() -> None:
+    """As after ``make demo`` and ``skyloop install cockpit``."""
+    program = "import sys; sys.modules['mcap'] = None; import skyloop.cockpit.server, skyloop.cockpit.recordings"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from skyloop.recording.layout import Channel
-    from skyloop.recording.reader import Described, Recording
+    from skyloop.recording.listing import Described
+    from skyloop.recording.reader import Recording
     from skyloop.recording.review.compare import Comparison
     from skyloop.recording.review.summary import Delay, Row, Summary
     from skyloop.recording.review.video import Videos
@@ -90,7 +91,7 @@ def list_recordings(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
     """List the recordings in a folder: drones, start and duration. Problems with a file are shown in its row."""
-    from skyloop.recording.reader import ENDING, describe, shown_name
+    from skyloop.recording.listing import ENDING, describe, shown_name
 
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)
@@ -365,7 +366,7 @@ def info_parts(recording: Recording, summary: Summary) -> Iterator[RenderableTyp
 
 def _listing(rows: Sequence[tuple[Path, Described]]) -> Table:
     """Return the recordings in a folder as a table."""
-    from skyloop.recording.reader import shown_name
+    from skyloop.recording.listing import shown_name
 
     table = Table(box=None)
     for title in ("recording", "begun", "lasts", "drones", "problem"):

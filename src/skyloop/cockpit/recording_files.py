@@ -19,7 +19,7 @@ import msgspec
 from skyloop import files
 from skyloop.errors import RefusedError, UnknownNameError, UsageError
 from skyloop.messages import Refusal
-from skyloop.recording.reader import ENDING
+from skyloop.recording.listing import ENDING
 
 TRASH: Final = "trash"
 NOTES_ENDING: Final = ".notes.json"

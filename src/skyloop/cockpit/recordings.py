@@ -38,8 +38,8 @@ from skyloop.errors import (
 )
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Refusal, Severity
 from skyloop.recording.layout import Channel
+from skyloop.recording.listing import ENDING, Described, describe, shown_name
 from skyloop.recording.plain import Course
-from skyloop.recording.reader import ENDING, Described, describe, shown_name
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

@@ -1,8 +1,7 @@
-"""Read a recording: its drones, and their samples in order of reception; describe the files in a folder."""
+"""Read a recording: its drones, and their samples in order of reception."""
 
 from __future__ import annotations
 
-import os
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -11,12 +10,10 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, Final
-
-import msgspec
+from typing import IO, Any
 
 from skyloop.clock import NS_PER_S
-from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError
+from skyloop.errors import FileFormatError, UnknownNameError
 from skyloop.messages.frame import H264
 from skyloop.recording import layout, scan
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, End, FrameRecord, Start, Topic
@@ -25,7 +22,6 @@ from skyloop.recording.scan import Message, Piece, Scan
 
 #: Called with the fraction of a file read so far, 0 to 1.
 Progress = Callable[[float], object]
-ENDING: Final = ".mcap"
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,33 +358,3 @@ def _foreign(found: Scan) -> str:
         return f"{found.path} ends before its first sample: {found.cut}"
     shown = ", ".join(topics[:5]) + (", …" if len(topics) > 5 else "")
     return f"{found.path} is an MCAP file, but not a Skyloop recording (its topics: {shown or 'none'})"
-
-
-class Described(msgspec.Struct, frozen=True):
-    """A summary of a recording."""
-
-    started: float | None = None  #: Unix time [s]; None if unknown
-    drones: tuple[str, ...] = ()
-    seconds: float | None = None  #: time from the first message to the last
-    problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
-
-
-def shown_name(path: Path) -> str:
-    """Return a file's name as text, with non-UTF-8 bytes in hexadecimal."""
-    return os.fsencode(path.name).decode(errors="backslashreplace")
-
-
-def describe(path: Path) -> Described:
-    """Describe a file without decompressing anything. The file's content never causes an exception."""
-    try:
-        recording = Recording.open(path)
-        return Described(
-            started=recording.start.started_unix_ns / NS_PER_S,
-            drones=tuple(drone.name for drone in recording.drones),
-            seconds=round(recording.seconds, 3),
-            problem=recording.cut,
-        )
-    except SkyloopError as error:
-        return Described(problem=str(error).removeprefix(f"{path} ").replace(path.name, shown_name(path)))
-    except Exception as error:  # noqa: BLE001  an unexpected error in one file must not hide the others
-        return Described(problem=f"{shown_name(path)} can't be read: {error!r:.300}")

@@ -18,7 +18,7 @@ from skyloop.cockpit import recordings as recordings_module
 from skyloop.cockpit.recordings import MAX_CHILDREN, MAX_WAITING, Recordings, Reports
 from skyloop.cockpit.security import foreign, own_names
 from skyloop.errors import LinkError, RefusedError, UsageError
-from skyloop.recording.reader import describe
+from skyloop.recording.listing import describe
 from tests.support.cockpit import FakeRecorder
 from tests.support.cockpit_page import served
 

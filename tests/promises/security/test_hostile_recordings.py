@@ -30,8 +30,9 @@ from skyloop.errors import FileFormatError, SkyloopError
 from skyloop.messages.frame import MAX_PIXELS, MAX_SCANS, image_size, why_not_decoded
 from skyloop.recording import scan
 from skyloop.recording.layout import Channel
+from skyloop.recording.listing import describe
 from skyloop.recording.pictures import Group, Picture, decode_image
-from skyloop.recording.reader import Recording, describe
+from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import recover, summarise
 from skyloop.recording.review.tables import export_csv, export_npz, read
