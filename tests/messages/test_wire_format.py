@@ -117,5 +117,5 @@ def test_numbers_in_the_text_about_the_local_transport() -> None:
     assert f"1 to {MAX_TOPIC} characters" in LOCAL
     assert f"at most {packets.MAX_REASON} bytes" in LOCAL
     assert f"1 to {MAX_PACKET:,} bytes".replace(",", " ") in LOCAL
-    assert f"At most {MAX_SUBSCRIPTIONS} at a time" in LOCAL
+    assert f"at most {MAX_SUBSCRIPTIONS} subscriptions at a time" in LOCAL
     assert f"at most {MAX_LEASES} leases a camera" in LOCAL

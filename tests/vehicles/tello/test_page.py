@@ -36,7 +36,7 @@ def test_times() -> None:
 def test_the_effect_of_a_full_stick() -> None:
     full = Scale()
     assert (full.speed, full.climb, full.yaw_rate) == (1.0, 1.0, 1.75)
-    assert "taken for 1 m/s, 1 m/s of climb and 1.75 rad/s" in section("docs/tello.md", "## The driver")
+    assert "assumed to mean 1 m/s, 1 m/s of climb and 1.75 rad/s" in section("docs/tello.md", "## The driver")
 
 
 def test_nan_is_not_a_full_stick() -> None:
