@@ -321,7 +321,7 @@ def test_ports_in_use_are_refused_without_leaks(drone: ArdroneFirmware) -> None:
     with ArdroneFirmware(host, ports=Ports.free()) as another:
         with pytest.raises(UsageError, match="already running"):
             another.start()
-        with pytest.raises(UsageError, match="taken already"):
+        with pytest.raises(UsageError, match="already taken"):
             ArdroneFirmware(host, ports=Ports.free()).start()
 
 
