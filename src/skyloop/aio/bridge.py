@@ -8,7 +8,6 @@ import inspect
 import re
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
-from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from functools import wraps
 from types import TracebackType
@@ -393,25 +392,25 @@ class Swarm:
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
-        begun: list[Future[T]] = []
+        running: set[asyncio.Task[Any]] = set()  # changed on this event loop only: a thread once came too late
         over = False
 
         async def call(drone: Drone) -> T:
-            if over:
+            task = asyncio.current_task()
+            if over or task is None:
                 raise asyncio.CancelledError
+            running.add(task)
             return await function(drone)
 
         def wait_for(drone: client.Drone) -> T:
-            waiting = asyncio.run_coroutine_threadsafe(call(ours[id(drone)]), loop)
-            begun.append(waiting)
-            return waiting.result()
+            return asyncio.run_coroutine_threadsafe(call(ours[id(drone)]), loop).result()
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
         finally:  # otherwise, after a cancellation, they would go on commanding and conflict with the next commands
             over = True
-            for waiting in begun:
-                waiting.cancel()
+            for task in running:
+                task.cancel()
 
     @like(client.Swarm.ticks)
     async def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
