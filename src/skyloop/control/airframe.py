@@ -28,8 +28,8 @@ from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
-#: Drag on a small quadrotor at a few metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (Engel, Sturm and
-#: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
+#: Drag on a small quadrotor at a few metres per second [1/s]. Identified values: 0.58 for an AR.Drone 2 (Engel, Sturm
+#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim``).
 DRAG_PER_S: Final = 0.45
 _HISTORY_S: Final = 3.0  # length of the motion history
 _SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates
@@ -39,7 +39,7 @@ _STEEPEST: Final = 0.5  # minimum cosine of the tilt; a vehicle that tilts more 
 
 
 def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
-    """Return a sighting's time; None if it lies in the future, because the sighting would seem fresh until then."""
+    """Return a sighting's time; None if it lies in the future, because such a sighting would seem fresh until then."""
     return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
 
 
@@ -90,7 +90,7 @@ class Airframe:
         feedback: The newest sample, with non-finite values removed; None before the first sample.
         by_tilt: Whether the vehicle reports no velocity, so that :class:`TiltVelocity` estimates it from the attitude.
         interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
-            axes stored before such a gap are off by the distance flown during the gap.
+            axes stored before such a gap are wrong by the distance flown during the gap.
     """
 
     def __init__(self, *needs: Part) -> None:
@@ -145,7 +145,7 @@ class Airframe:
         return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
-        """Return a sentence naming the required parts of the state that are unknown now; empty if all are known."""
+        """Return a sentence naming the required parts of the state that are unknown; empty if all are known."""
         old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 

@@ -65,7 +65,7 @@ class ApproachMarker(FollowMarker):
             size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: Settings for the control law; None for the defaults with ``aside_rad`` 0.
+            settings: Settings for the control law; if None, the defaults with ``aside_rad`` set to 0.
 
         Raises:
             UsageError: A number is not finite and greater than 0.
@@ -165,7 +165,7 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Circles a position, facing it or facing away from it, and then hovers; :meth:`run` returns.
+    """Circles a position while facing towards or away from it. At the end, the vehicle hovers and :meth:`run` returns.
 
     Requires the vehicle's position, like :class:`FollowPath`.
     """

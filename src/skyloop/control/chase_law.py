@@ -40,7 +40,7 @@ from skyloop.messages.geometry import wrap_angle
 class FollowMode(StrEnum):
     """How to follow a target."""
 
-    FOLLOW = "follow"  #: keep a distance and, if given, a side
+    FOLLOW = "follow"  #: keep a distance from the target and, if specified, stay on one side of it
     ORBIT = "orbit"  #: circle the target, even while it moves
     LOOK = "look"  #: stay in place and turn towards the target
 
@@ -107,7 +107,7 @@ class ChaseSettings:
     tilt_rad: float = 0.33  #: maximum tilt of a vehicle flown by attitude
     tilt_gain: float = 3.0  #: acceleration per unit of velocity error of a vehicle flown by attitude [1/s]
     lean_rad: float = 0.5  #: maximum lean that the model assumes for a vehicle flown by velocity
-    seen_s: float = 0.4  #: time after the last sighting for which the target still counts as seen
+    seen_s: float = 0.4  #: time for which the target still counts as seen after the last sighting
     predict_s: float = 2.0  #: time to follow a hidden target's predicted motion while slowing down
     hover_s: float = 4.0  #: time to hover afterwards, looking to both sides of the target's predicted position
     give_up_s: float = 25.0  #: time from the last sighting until giving up
@@ -132,7 +132,7 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
     def within(self, limits: Mapping[str, Value]) -> ChaseSettings:
-        """Return these settings clamped to a drone's limits, so that the law never expects more than is allowed.
+        """Return these settings clamped to a drone's limits, so that the law plans for no more than is allowed.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
@@ -159,7 +159,7 @@ _CONFIDENT_SIGMA_M = 0.35  # maximum standard deviation for a position to count 
 _UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
 _KEEP_SIDE_S = 1.0  # time for which evasion stays on the same side
 _HEAD_ON_SHARE = 0.2  # fraction of the clearance below which a pass is head-on, so that both sides are equally good
-_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep to the side opposite to the target's motion
+_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep that goes to the side opposite the target's motion
 _HEIGHT_REACHED_M = 0.1  # distance from a parallax height at which the vehicle heads for the other one
 _ALONG_M_S = 0.4  # minimum speed for a target's direction of motion to be usable
 
@@ -342,7 +342,7 @@ class ChaseLaw:
         return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
 
     def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
-        """Return the yaw rate that turns the vehicle towards the target, or ``aside`` [rad] to the left of it."""
+        """Return the yaw rate for turning to face the target, or a direction ``aside`` [rad] to its left."""
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
@@ -390,7 +390,7 @@ class ChaseLaw:
         return velocity + s.response_s * change
 
     def _round(self, state: TargetState, sight: Array, across: float) -> float:
-        """Return the speed to the left of the line of sight that moves the vehicle to its side of the target."""
+        """Return the speed to the left, across the line of sight, for moving to the chosen side of the target."""
         s = self.settings
         if float(np.hypot(*state.velocity)) > _ALONG_M_S:
             self._heading = math.atan2(state.velocity[1], state.velocity[0])
@@ -486,7 +486,7 @@ class ChaseLaw:
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _for_parallax(self, height: float, altitude_m: float) -> float:
-        """Return the next of two heights that reveal the range; rising is preferred because people may be below."""
+        """Return the next of two heights for measuring the range; climb first, because people may be below."""
         s = self.settings
         other = height = within(height, s.lowest_m, s.highest_m)
         if s.parallax_m is not None:
@@ -521,7 +521,7 @@ class ChaseLaw:
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
-    """Return distance [m] and time [s] of the closest approach, and the unit vector towards the side to pass on.
+    """Return the distance [m] and time [s] of the closest approach, and the unit vector towards the passing side.
 
     ``here`` is the vehicle's position relative to the other object, and ``moving`` its relative velocity.
     """

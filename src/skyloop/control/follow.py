@@ -215,7 +215,7 @@ class FollowScore:
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Return the estimated minus the wanted distance for each sighting from ``after_s`` after the first one."""
+        """Return the estimated minus the wanted distance for each sighting, starting ``after_s`` after the first."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 

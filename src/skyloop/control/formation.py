@@ -171,7 +171,7 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
 
 
 def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
-    """Return the closest approach between drones that fly straight from start to goal, all in the same time.
+    """Return the closest approach between drones that fly straight from start to goal and all take the same time.
 
     Args:
         starts: Start positions, (n, 3) [m].

@@ -6,7 +6,7 @@ only odometry drift affects them. Facing the opening, the vehicle moves onto the
 alignment improves, and flies through. The last metre and a half is flown by odometry, because at that range the gate no
 longer fits into the image.
 
-The way around obstacles is found by Dijkstra's algorithm in a two-dimensional visibility graph over points around each
+The path around obstacles is found by Dijkstra's algorithm in a two-dimensional visibility graph over points around each
 obstacle (Lozano-Pérez and Wesley, "An algorithm for planning collision-free paths among polyhedral obstacles",
 Communications of the ACM 22(10), 1979).
 """
@@ -33,7 +33,7 @@ Point = tuple[float, float]
 
 _AROUND = 8  # number of graph points around each end of a wall
 _OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor that keeps lines between these points clear
-_WITHIN_M = 0.02  # margin by which the way may come closer to a wall than its start or goal
+_WITHIN_M = 0.02  # margin by which the path may be closer to a wall than its start or goal is
 
 
 class GatePhase(StrEnum):
@@ -208,8 +208,8 @@ class Wall(NamedTuple):
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
     """Return the points of the shortest way, including the goal but not the start; None if there is no way.
 
-    Start and goal may be too close to a wall, but the way comes no closer to it. Points are east, north [m]. Pass at
-    most a few dozen walls, because the effort grows with the cube of their number.
+    The start and goal may be too close to a wall, but the path gets no closer to that wall than they are. Points are
+    east, north [m]. Pass at most a few dozen walls, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)

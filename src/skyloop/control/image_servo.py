@@ -116,7 +116,7 @@ class ServoSettings:
     """Gain and limits of :class:`ImageServoLaw`."""
 
     gain: float = 0.8  #: [1/s]
-    #: Fraction of the velocity error that is added to the set-point against gusts if the velocity is known.
+    #: Fraction of the velocity error that is added to the set-point to counteract gusts, if the velocity is known.
     velocity_gain: float = 1.0
     speed_m_s: float = 0.8
     climb_m_s: float = 0.5
@@ -345,7 +345,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the current set-point. While the position is unknown, the attitude is level, which doesn't brake."""
+        """Compute the current set-point. While the position is unknown, the attitude is level, without braking."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -375,9 +375,9 @@ class FlowLaw(AirframeLaw):
 class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, using a downward-facing camera.
 
-    It requires only attitude and height from the vehicle's feedback and flies by attitude set-points. Without sight of
-    the ground, the vehicle hovers and may drift, and a warning event is published. Once the ground is in view again,
-    the behaviour holds its new position.
+    It requires only attitude and height from the vehicle's feedback and flies by attitude set-points. If the camera
+    can't see the ground, the vehicle hovers and may drift, and a warning event is published. Once the ground is in view
+    again, the behaviour holds its new position.
     """
 
     name = "flow hover"

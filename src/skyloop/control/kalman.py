@@ -125,7 +125,8 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether the position was used. False means outside the gate (counted in :attr:`refused`) or too old.
+            Whether the position was used. False means that it was outside the gate (counted in :attr:`refused`) or too
+            old.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
@@ -239,7 +240,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from positions (3,) with standard deviations greater than 0."""
+    """Estimates a point's motion in levelled axes from measured positions (3,) with positive standard deviations."""
 
     def __init__(
         self,

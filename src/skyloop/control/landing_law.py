@@ -5,8 +5,8 @@ its own motion (:mod:`.response`), the vehicle flies to where the marker will be
 matches its velocity and acceleration. It descends while it is inside a cone above the marker, as in Saripalli,
 Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the
 cone it first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the image, the
-vehicle flies by prediction. If it would touch down too far off, it aborts and climbs along the marker's predicted path.
-After a number of aborted attempts it gives up and hovers at a safe height.
+vehicle flies by prediction. If the vehicle would touch down too far from the marker, it aborts and climbs along the
+marker's predicted path. After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ class LandingSettings:
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
     #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
-    #: ``blind_s``. Just above the marker (``nearly_m``), it is aborted only if the vehicle would miss the platform.
+    #: ``blind_s``. Just above it (below ``nearly_m``), a touch-down is aborted only if the vehicle would miss the
+    #: platform.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
@@ -200,7 +201,7 @@ class LandingLaw(AirframeLaw):
         return None if newest is None else float(np.hypot(*newest.velocity[:2]))
 
     def safe(self, now_ns: int) -> bool:
-        """Return whether the law has given up and reached a height at which it is safe to hover."""
+        """Return whether the law has given up and the vehicle has reached a safe height for hovering."""
         if self._gave_up_ns is None:
             return False
         altitude = self.airframe.altitude_m(now_ns)

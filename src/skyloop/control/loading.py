@@ -91,7 +91,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Return the line of the user's file that raised an exception, as text; empty if it was raised elsewhere."""
+    """Return the text of the line in the user's file that raised an exception; empty if raised elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -213,7 +213,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None if the file is missing, for example during its replacement."""
+    """Return a stamp that changes with each save; None if the file is missing, as while it is being replaced."""
     try:
         found = file.stat()
     except OSError:

@@ -103,10 +103,10 @@ class PathSettings:
     #: Gains for the position error [1/s, 1/s²]; ``velocity_gain`` replaces the derivative gain.
     gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))
     #: Fraction of the velocity error that is added to the set-point if the velocity is known. Vehicles with a soft
-    #: velocity loop then respond sooner and are pushed less far by gusts.
+    #: velocity loop then respond sooner, and gusts push them less far.
     velocity_gain: float = 1.0
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.25  #: the vehicle's response time, by which the velocity is fed forward
+    lead_s: float = 0.25  #: the vehicle's response time; velocity is fed forward to compensate for it
     limits: SetpointLimits = field(
         default_factory=lambda: SetpointLimits(
             speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0
@@ -224,7 +224,7 @@ class PathLaw:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
-        """Advance the path's time, more slowly beyond the leash and not at all beyond twice the leash."""
+        """Advance the path's time; slow down beyond the leash, and stop beyond twice the leash."""
         share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 

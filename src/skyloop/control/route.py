@@ -122,8 +122,8 @@ class Route(_Part, frozen=True, kw_only=True):
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
     name: Name = ""  #: A human-readable name
     speed: Speed = 0.5  #: maximum speed to waypoints without their own [m/s]
-    #: what to do after the last waypoint: ``hover``, ``land`` or ``return``, which means to fly back to the start of
-    #: the route at the last waypoint's height and land there
+    #: what to do after the last waypoint: ``hover``, ``land`` or ``return`` (fly back to the start of the route at the
+    #: last waypoint's height and land there)
     end: Literal["hover", "land", "return"] = "hover"
     version: Literal[1] = VERSION  #: version of the file format
 

@@ -92,7 +92,7 @@ class RouteLaw:
         self.problem = ""  #: why the law paused without a request; empty otherwise
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
-        self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun
+        self._arrived = False  # whether the vehicle has reached the waypoint and started the actions there
         self._skipped_all = False  # whether all waypoints were skipped while paused
         self._since_ns: int | None = None  # start of the current action
         self._deadline_ns: int | None = None

@@ -5,9 +5,9 @@ Navigation", Wiley 2001, section 10.3) of the position of the target's foot, its
 and the logarithm of the target's height. Each box provides an azimuth and the slopes to its lower and upper edges. The
 range and its uncertainty are derived from all available cues: the known size of a class or target, the ground below the
 target (if the vehicle knows its own height) and the vehicle's motion, because close objects grow faster. If there is no
-cue, a nominal initial range is assumed. All ranges then scale with it, and the control law keeps the apparent size
-constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object
-tracking and following for unmanned aerial vehicles", SSRR 2013).
+cue, a nominal initial range is assumed. All ranges are then proportional to this initial range, and the control law
+keeps the apparent size constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision
+based GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013).
 
 Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level them, so
 that the vehicle's roll and pitch don't move an object. For an edge outside the image, only a bound is known.
@@ -164,7 +164,7 @@ _NEAREST_M: Final = 0.3  # minimum range
 _RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning, from gusts and an inaccurate drag constant
 _LATE_S: Final = 0.5  # maximum age of a useful box
 _ADAPTING: Final = 0.3  # weight of a single box in the average surprise
-_USUAL: Final = 1.5  # maximum surprise that counts as noise
+_USUAL: Final = 1.5  # maximum surprise that is still attributed to noise
 _MOST_SURPRISE: Final = 4.0  # maximum contribution of a single box to the average surprise
 _STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move straight on
 _GONE_S: Final = 0.2  # minimum time out of view before a target counts as hidden ...
@@ -412,7 +412,7 @@ class TargetEstimator:
         )
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a new filter, not started yet, for the same target once it comes back into view."""
+        """Return a new filter for the same target, to be started once the target is back in view."""
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:

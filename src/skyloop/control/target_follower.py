@@ -152,7 +152,7 @@ class TargetFollower(AirframeLaw):
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
             state = None  # the frame's time is in the future or there is no recent feedback, so the pose is unknown
-        # If the velocity is unknown, the vehicle hovers, so its last position is used.
+        # If the velocity is unknown, the vehicle is hovering, so use its last known position.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
@@ -325,8 +325,8 @@ class FollowTarget(Behaviour):
             bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
                 ahead of it, π behind it. If None, the settings apply, which allow any side by default.
             mode: ``follow``, ``orbit`` or ``look``.
-            detector: Detector that searches every frame, or the name of a processor whose results are detections, such
-                as that of ``skyloop detect``. If None, the target is tracked by appearance only.
+            detector: Detector that searches every frame, or the name of a processor that returns detections, such as
+                the one started by ``skyloop detect``. If None, the target is tracked by appearance only.
             height_m: The target's height, if known, for estimating its distance; by default, that of its class. If
                 neither is available, the drone only turns until its own motion has revealed the range.
             traits: All prior knowledge about the target, as an alternative to ``height_m``.

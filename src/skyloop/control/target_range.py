@@ -65,7 +65,7 @@ class RangeEstimator(TargetEstimator):
         self._weights = np.ones(0)
         self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground; None once dropped
         self._sight = self._about = np.zeros(3)  # initial line of sight, and recent mean position of the vehicle
-        self._stirred_m = 0.0  # maximum distance from that position so far, across that line of sight
+        self._stirred_m = 0.0  # maximum distance from that position so far, measured across the initial line of sight
         self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
         self._jumped_ns: int | None = None  # time of the last jump of the height
         self._base_m = 0.0  # averaged difference between altimeter and climb [m]
@@ -175,7 +175,7 @@ class RangeEstimator(TargetEstimator):
         return True if self._known and likeliest is self._on_ground else None
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a new filter, not started yet, for the same target once it comes back into view."""
+        """Return a new filter for the same target, to be started once the target is back in view."""
         before, stands = self.at(at_ns), self.on_ground
         traits = self.traits if stands is None else replace(self.traits, on_ground=stands)
         return RangeEstimator(

@@ -1,4 +1,4 @@
-"""Match detections to objects, which keep their identities when they cross, hide and return. Pure.
+"""Match detections to objects, so that objects keep their identities when they cross, hide or return. Pure.
 
 Detections are matched with filtered estimates of the objects' current positions, not with their positions in the last
 image. The vehicle's own motion therefore does not matter, and look-alikes are distinguished by position and motion. The
@@ -39,9 +39,9 @@ _FAR_BEHIND: Final = 1.3  # ratio of ranges above which an object is hidden by a
 _EARLIER_S: Final = 0.5  # time before a meeting at which velocities are not yet distorted by merging boxes
 _APART_S: Final = 0.6  # time after a separation at which velocities are known again
 _DIFFER_M_S: Final = 0.8  # minimum velocity difference before a meeting for telling two objects apart
-_TURNED: Final = 0.3  # reversed fraction of that difference at which two objects count as confused
+_TURNED: Final = 0.3  # the objects count as confused if this fraction of that difference has reversed
 _KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different object
-_YOUNG_S: Final = 0.5  # the same for objects seen only once
+_YOUNG_S: Final = 0.5  # time to remember hidden objects that were seen only once
 _CONFIRMED: Final = 3  # number of detections needed to confirm an object
 _OF_A_PART: Final = 1.0  # colour difference assumed for objects cut off by the image
 _SETTLED: Final = 8  # number of detections after which an object can contest others; new ones may be two in one
@@ -114,7 +114,7 @@ class _Seen(NamedTuple):
 def unlikeness(one: Floats, other: Floats) -> float:
     """Return the squared colour difference of two objects, in units of the usual variation due to light and folds.
 
-    ``other`` is either (6,) or contains the colours of n strips of a box, (n, 6), of which the most similar is used.
+    ``other`` contains the colours of one box, (6,), or of n strips of a box, (n, 6); the most similar strip is used.
     """
     return float(np.min(_unlike(one, other)))
 
@@ -153,7 +153,7 @@ class Scene:
     """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene; ``traits`` by class override :data:`~.target_estimate.TRAITS`."""
+        """Initialise an empty scene; ``traits`` by class name replace those in :data:`~.target_estimate.TRAITS`."""
         self.objects: dict[int, SceneObject] = {}  #: objects by number
         self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
         #: numbers of objects that are not matched with detections, because their return is decided elsewhere

@@ -200,7 +200,7 @@ class MotionCapture:
 
         Args:
             function: A function called on a separate thread, for which up to 256 events can wait.
-            inline: Whether to call the function on the thread that detected the change instead.
+            inline: Whether to call the function on the thread that detected the change instead of a separate one.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 

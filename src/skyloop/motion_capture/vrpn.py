@@ -15,7 +15,7 @@ offset  type   meaning
 ======  =====  ====================================================================================
 
 A description (type -1 for a sender, -2 for a type) has the number in its sender field. Its payload is the name's length
-(u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``. Its
+(u32, including the final NUL) and the name. Poses have the type with the description ``vrpn_Tracker Pos_Quat``. Its
 payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
 
 A client that never sends a UDP port receives everything over TCP.
@@ -266,7 +266,7 @@ class VrpnSource:
             self._ended.wait(AGAIN_S)
 
     def _receive(self) -> None:
-        """Receive over one connection, from its start to its end."""
+        """Receive data over one connection until it ends."""
         address = self._system.host, self._system.port or DEFAULT_PORT
         with socket.create_connection(address, CONNECT_S) as connection:
             connection.settimeout(POLL_S)

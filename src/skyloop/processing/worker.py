@@ -165,7 +165,7 @@ class Output:
     __slots__ = ("shapes", "value")
 
     def __init__(self, value: Any, shapes: Iterable[Shape] = ()) -> None:
-        """Combine a value with shapes.
+        """Combine a result with shapes to draw.
 
         Args:
             value: The result; None publishes nothing.
@@ -254,7 +254,7 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # frees its memory for the proxy while waiting for the next
+                    del arrival  # frees its memory for the proxy while this thread waits for the next frame
         finally:
             self.membership.close()
 
@@ -415,8 +415,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     processor: str
     camera: str
     processes: int = 1  #: number of workers that these statistics cover
-    part: int = 0  #: index of this worker's part of the frames; 0 in statistics of several workers
-    parts: int = 0  #: number of parts, 0 if there is none now; in statistics of several workers, how many have a part
+    part: int = 0  #: index of this worker's share of the frames; 0 if the statistics cover several workers
+    parts: int = 0  #: number of shares, 0 if there is none now; in statistics of several workers, how many have a share
     workers: int = 0  #: number of workers of this processor and camera that are known to the proxy
     frames: int = 0  #: number of frames in the worker's part
     results: int = 0
@@ -454,7 +454,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 def together(found: Iterable[Status]) -> Status | None:
     """Combine the statistics of several workers of one processor; None if there are none.
 
-    Counts and rates are sums; ages are the worst ones.
+    Counts and rates are summed; ages are maxima.
     """
     each = list(found)
     if len(each) < 2:

@@ -74,11 +74,11 @@ class _State(Enum):
 class LongTermTracker(Tracker):
     """Tracks a target, reports its loss, and finds it again anywhere in the image.
 
-    Another tracker follows the target. Each of its boxes is compared with a memory of the target's appearances, learned
-    from boxes that match well, and with look-alikes seen near it. A box that is not verified is withheld and the target
-    reported as lost. After ten such images the whole image is searched, at one size per image. A place that is similar
-    enough, and clearly more similar than any other place or known look-alike, is tracked on trial and returned after
-    three images.
+    The target is followed by another tracker. Each of its boxes is compared with a memory of the target's appearances,
+    learned from boxes that match well, and with look-alikes seen near it. A box that is not verified is withheld and
+    the target reported as lost. After ten such images the whole image is searched, at one size per image. A place that
+    is similar enough, and clearly more similar than any other place or known look-alike, is tracked on trial and
+    returned after three images.
 
     A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
     new box. The score is the similarity to the closest appearance; ``confidence`` is calibrated on simulated people.
@@ -202,7 +202,7 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Return whether a place clearly contains a look-alike. Only tracking can tell an exact twin apart."""
+    """Return whether a place clearly contains a look-alike. Only tracking can distinguish exact twins."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 

@@ -36,7 +36,7 @@ LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
 GRID: Final = (8, 6)  #: number of cells across and down for measuring coverage
 _WORST_SHARE: Final = 2.5  # views whose error exceeds this many times the median are removed ...
 _WORST_PX: Final = 0.3  # ... and above this
-_NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
+_NEW_SHARE: Final = 0.08  # a view counts as new if its corners have moved by this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
@@ -336,8 +336,8 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # k3 is left out: estimated from few images, it is mostly noise and bends the image's corners, where there was no
-    # data. Lenses that need k3 are fisheye lenses.
+    # k3 is left out: when estimated from few images, it is mostly noise and distorts the image's corners, where there
+    # are no data. Lenses that need k3 are fisheye lenses.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )

@@ -43,7 +43,7 @@ class ColourMask:
     """Selects pixels by hue at any brightness, if their saturation is high enough."""
 
     def __init__(self, colour: Rgb) -> None:
-        """Prepare the mask; UsageError for a colour that is invalid or too grey to have a hue."""
+        """Prepare the mask; raise UsageError if the colour is invalid or too grey to have a hue."""
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
             raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
         self._cv = opencv("finding a colour")
@@ -89,7 +89,7 @@ class BlobSighting:
 
 
 class BlobDetector:
-    """Detects connected areas of a colour that are large enough."""
+    """Detects sufficiently large connected areas of a colour."""
 
     def __init__(self, colour: Rgb, least_px: int = 12) -> None:
         """Prepare the detector.
@@ -325,7 +325,7 @@ class PoleDetector:
         return sorted(found, key=lambda one: -one.width_px)
 
     def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
-        """Return whether something colourful is directly above: probably a gate's bar that hides the top."""
+        """Return whether something colourful is directly above the pole: probably a gate's bar that hides its top."""
         column = min(max(round(x), 0), pixels.shape[1] - 1)
         above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
         return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())

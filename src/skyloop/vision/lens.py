@@ -150,7 +150,7 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Return the ideal pinhole's focal length; ``balance`` 0 shows only valid pixels, 1 shows the whole view."""
+    """Return the ideal pinhole's focal length; ``balance`` 0 keeps only valid pixels, and 1 keeps the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
     reach = []  # for each side: distance from the axis in pixels, divided by its least and by its greatest direction
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):

@@ -73,7 +73,7 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 
 
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
-    """Keep the best of several overlapping boxes (left, top, right, bottom), class by class: non-maximum suppression.
+    """Apply non-maximum suppression: of overlapping boxes (left, top, right, bottom) of a class, keep only the best.
 
     Return the indices of the rows to keep, best first. Boxes of a class that overlap by more than ``iou`` count as one.
     """

@@ -137,4 +137,4 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return an exception's text, shortened and on one line."""
-    return " ".join(str(error).split())[:300]  # OpenCV's `err` belongs to the class and holds the last error anywhere
+    return " ".join(str(error).split())[:300]  # OpenCV keeps `err` on the class; it holds the last error anywhere
