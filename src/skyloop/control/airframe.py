@@ -113,7 +113,7 @@ class Airframe:
 
         Args:
             feedback: The new sample; non-finite values count as missing. If it is several seconds older than the last
-                one, the history restarts, because the last one's time was wrong or the proxy's clock was set back.
+                one, the history restarts, because the last sample's time was wrong or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
@@ -253,8 +253,7 @@ class TiltVelocity:
             feedback: The vehicle's newest state; a landed vehicle is taken to be at rest.
 
         Returns:
-            The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None if the attitude is
-            unknown.
+            The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None without an attitude.
         """
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
         if roll is None or pitch is None or yaw is None:
@@ -306,7 +305,7 @@ class AirframeLaw:
         """Forget everything stored in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Return whether all required parts of the state are known; pause if not, or if the last step was long ago."""
+        """Return whether all required parts of the state are known; pause if not, or after a long gap between steps."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
         if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):

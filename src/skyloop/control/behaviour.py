@@ -83,7 +83,8 @@ class Behaviour(Controller):
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        # abs() is needed because a frame with a time in the future would otherwise hide that frames have stopped.
+        # abs() is needed because a frame with a time in the future would otherwise hide the fact that frames have
+        # stopped.
         if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
@@ -168,7 +169,7 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Return a camera of the vehicle by name, or its first; raise UnknownNameError if there is none."""
+    """Return a camera of the vehicle by name, or its first camera; raise UnknownNameError if there is none."""
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

@@ -74,7 +74,7 @@ class ChaseSettings:
     nearest_m: float = 2.0  #: minimum distance to the target; the vehicle backs off from a target that comes closer
     clear_m: float = 1.5  #: minimum distance to other detected objects
     #: Side of the target to stay on, as a counter-clockwise angle from its direction of motion: 0 is in front of the
-    #: target, π behind it and π/2 on its left. With None, the vehicle stays on the side that it is on.
+    #: target, π behind it and π/2 on its left. If None, the vehicle stays on its current side.
     bearing_rad: float | None = None
     orbit_m_s: float = 0.8  #: speed around the target; positive is counter-clockwise as seen from above
     #: Maximum horizontal distance from the start, not exceeded even to evade a target; None means no leash. It is
@@ -83,8 +83,8 @@ class ChaseSettings:
     height_m: float | None = None  #: height above the ground; None for the height at the start
     lowest_m: float = 0.8  #: minimum height above the ground
     highest_m: float = 4.0  #: maximum height above the ground
-    #: Distance to rise (or sink, if rising is impossible) and return in order to measure the range of a target that may
-    #: not be on the ground. With None, the vehicle waits for the range without moving.
+    #: Distance by which to rise (or sink, if rising is impossible) and return, to measure the range of a target that
+    #: may not be on the ground. If None, the vehicle waits without moving until the range is known.
     parallax_m: float | None = 0.4
     #: maximum elevation of the target's centre, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
@@ -272,7 +272,7 @@ class ChaseLaw:
         self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
-        """Return the vehicle's motion at the time when a set-point sent now takes effect, given those already sent."""
+        """Return the vehicle's motion at the time when a set-point sent now takes effect, given earlier set-points."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
         if predicted is None:
@@ -418,7 +418,7 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
         The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
-        position is uncertain, for example out of view, the vehicle stays further away and is prepared for it to stop.
+        position is uncertain, for example out of view, the vehicle stays further away and assumes that it may stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m

@@ -199,8 +199,8 @@ def kept_apart(
     """Change velocities so that drones closer together than ``apart_m`` separate.
 
     Their distance grows at a rate of ``gain`` times the missing distance, and each drone contributes half of that. If
-    one of them doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the
-    distance beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
+    one drone doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the distance
+    beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
 
     Args:
         velocities: Velocities in world axes, (n, 3) [m/s].

@@ -96,14 +96,14 @@ class Formation:
             slots: Positions in world axes, (n, 3) [m]; at least one for each drone.
             speed_m_s: Maximum speed of the drone that has the longest path.
             yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Time until drones not at their slots have failed; None allows ten seconds more than planned.
+            timeout_s: Time after which drones that are not at their slots have failed; None allows 10 s more than
+                planned.
 
         Returns:
             A report with the drones' final positions and how close they came to each other.
 
         Raises:
-            UsageError: A drone can't be flown by position, two would come closer than ``apart_m``, or no drone is
-                active.
+            UsageError: A drone can't be flown by position, two would be closer than ``apart_m``, or none is active.
             SwarmError: A drone failed, and the swarm's ``on_error`` is not ``"continue"``.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):

@@ -206,7 +206,7 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, including the goal but not the start; None if there is no way.
+    """Return the points of the shortest path, including the goal but not the start; None if there is no path.
 
     The start and goal may be too close to a wall, but the path gets no closer to that wall than they are. Points are
     east, north [m]. Pass at most a few dozen walls, because the effort grows with the cube of their number.
@@ -237,7 +237,7 @@ def _corners(ends: Array, reach: Array) -> list[Array]:
 
 
 def _shortest(points: Array, lengths: Array) -> list[Point] | None:
-    """Return the shortest way from the first point to the second one."""
+    """Return the shortest path from the first point to the second."""
     best, came = {0: 0.0}, {0: 0}
     queue = [(0.0, 0)]
     while queue:

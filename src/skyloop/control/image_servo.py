@@ -61,8 +61,8 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 def camera_twist(camera: CameraInfo) -> Array:
     """Return the matrix (6, 4) that converts motion of the levelled vehicle to the twist of a level camera.
 
-    The columns stand for forward, left, up [m/s] and yaw rate [rad/s]. The camera's mounting position matters, because
-    a camera ahead of the centre swings sideways when the vehicle turns.
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's mounting position matters, because a
+    camera ahead of the centre swings sideways when the vehicle turns.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -291,7 +291,7 @@ class FlowSettings:
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
     lead_s: float = 0.12  #: delay between computing a set-point and its effect
-    fresh_s: float = 0.3  #: time to carry on without sight of the ground
+    fresh_s: float = 0.3  #: time to continue while the ground is out of sight
 
     def __post_init__(self) -> None:
         require_positive(self.__dataclass_fields__, **asdict(self))
@@ -413,7 +413,7 @@ class FlowHover(Behaviour):
         return self._flow_law.off_m
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point, or hover while the ground is out of view, which the event for the phase reports."""
+        """Send the set-point, or hover while the ground is out of view; the event for the phase reports this."""
         if self.phase is FlowPhase.HOLDING:
             super().steer(wanted)
         else:

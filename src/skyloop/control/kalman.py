@@ -125,8 +125,7 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether the position was used. False means that it was outside the gate (counted in :attr:`refused`) or too
-            old.
+            Whether the position was used. False means that it was outside the gate (counted in :attr:`refused`) or old.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
@@ -201,8 +200,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
             dimensions: Number of dimensions of the position; 1 or more.
             intensity_m2_s3: Intensity of the acceleration's white noise; its root is the velocity change in 1 s.
             speed_m_s: Initial standard deviation of each velocity component.
-            gate: Mahalanobis distance, in standard deviations, above which measurements are refused; ``math.inf``
-                accepts all.
+            gate: Maximum Mahalanobis distance of a measurement, in standard deviations; ``math.inf`` accepts all.
 
         Raises:
             UsageError: An argument is out of range.

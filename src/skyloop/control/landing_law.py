@@ -68,8 +68,8 @@ class LandingSettings:
     cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
     cone: float = 0.2  #: increase of the cone's radius per metre of height
     view: float = 0.3  #: ratio of offset to height above which the vehicle climbs to see the marker
-    #: Height below which the vehicle relies on the filter and descends even without sight of the marker, provided that
-    #: it is over the marker's centre, matches its speed, and the marker has moved as predicted ``foresight_s`` earlier.
+    #: Height below which the vehicle relies on the filter and descends even if the marker is out of sight, provided
+    #: that it is over the marker's centre at the same speed, and the marker moved as predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
     commit_off_m: float = 0.08
     commit_m_s: float = 0.25
@@ -78,8 +78,7 @@ class LandingSettings:
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
     #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
-    #: ``blind_s``. Just above it (below ``nearly_m``), a touch-down is aborted only if the vehicle would miss the
-    #: platform.
+    #: ``blind_s``. Just above it (below ``nearly_m``), it is aborted only if the vehicle would miss the platform.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
@@ -92,7 +91,7 @@ class LandingSettings:
     turn_rad_s: float = 0.8
     long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
 
-    fresh_s: float = 0.35  #: time to carry on without a sighting
+    fresh_s: float = 0.35  #: time to continue without a sighting
     recovering_s: float = 4.0  #: time to follow the predicted position of an unseen marker before searching
     search_height_m: float = 2.6  #: height above the ground for searching and for hovering safely
     search_speed_m_s: float = 1.0
@@ -292,7 +291,7 @@ class LandingLaw(AirframeLaw):
         return clamped(1.5 * error, s.turn_rad_s)
 
     def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
-        """Return the marker's motion relative to the vehicle; None if it has never been seen or not recently."""
+        """Return the marker's motion relative to the vehicle; None if it was never seen, or not recently."""
         s = self.settings
         if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
             return None
@@ -395,7 +394,7 @@ class LandingLaw(AirframeLaw):
         return clamped(max(0.0, off / s.view - height), s.climb_m_s)
 
     def _searched(self, own: Motion, now_ns: int) -> Array:
-        """Return the search velocity: first wait at the marker's last position, or here, then fly the spiral."""
+        """Return the search velocity: wait at the marker's last position or, if unknown, here; then fly the spiral."""
         s = self.settings
         if self._searching_ns is None:
             self._searching_ns = now_ns

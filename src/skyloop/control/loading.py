@@ -27,7 +27,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
     """Load the controller class from a Python file; the class name is only needed if there are several.
 
     The file is executed and, like a script, can import modules from its own folder. Imported classes are considered
-    only if the file itself defines no controller. FileFormatError states the line that can't be executed.
+    only if the file itself defines no controller. A :class:`FileFormatError` states the line that can't be executed.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache treats files with the same size and second as unchanged."""
+    """Always compiles the source, because Python's cache can't tell files of the same size and second apart."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)

@@ -2,7 +2,7 @@
 
 The path's velocity is fed forward with the vehicle's response time as lead, and a PI controller for the position
 removes the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund,
-"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so
+"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at its time of measurement, so
 delays cause no error.
 """
 
@@ -68,7 +68,7 @@ class FixedYaw:
 
 @dataclass(frozen=True, slots=True)
 class AlongPath:
-    """Yaw along the direction of flight plus ``offset`` [rad], unchanged while the vehicle hovers or only climbs."""
+    """Yaw to face along the path, plus ``offset`` [rad]; the yaw is kept while the vehicle hovers or only climbs."""
 
     offset: float = 0.0
 
@@ -81,7 +81,7 @@ class AlongPath:
 
 @dataclass(frozen=True, slots=True)
 class LookAt:
-    """Yaw towards a point, x and y in world axes [m], unchanged while the vehicle is above or below it."""
+    """Yaw to face a point, x and y in world axes [m]; the yaw is kept while the vehicle is above or below the point."""
 
     x: float
     y: float
@@ -186,7 +186,7 @@ class PathLaw:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Pause the path because the vehicle hovers or another client flies it; restart from rest without integral."""
+        """Pause the path because the vehicle hovers or another client flies it; restart at rest, with integral 0."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None

@@ -101,7 +101,7 @@ class Pid:
             slope = self._slope.value or 0.0
             self._integral += (old.p - new.p) * self._error - (old.d - new.d) * slope
         elif old.i > 0.0:
-            self._integral = 0.0  # without an integral gain, it would stay forever
+            self._integral = 0.0  # without an integral gain, the term would never change
         self._slope.time_constant_s = new.derivative_filter_s
         self._gains = new
 
@@ -142,7 +142,7 @@ class Pid:
     def applied(self, output: float) -> None:
         """Report the output that was actually applied, in case a limit outside this controller reduced it.
 
-        The integral term follows it (back-calculation). :meth:`step` calls this method with its own limited output.
+        The integral term then follows the applied output (back-calculation).
 
         Args:
             output: The applied output.

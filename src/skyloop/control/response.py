@@ -1,6 +1,6 @@
 """A model of how a vehicle responds to velocity set-points, used to predict its motion and invert the response. Pure.
 
-The model of the vehicle's own velocity loop is this: ``delay_s`` after a set-point was sent, the loop demands a lean
+The vehicle's own velocity loop is modelled as follows: ``delay_s`` after a set-point was sent, the loop demands a lean
 proportional to the velocity error, plus a trim. The lean follows with a lag of ``lag_s`` and accelerates the vehicle;
 so does the push of the air. The lean is known from the attitude. A Kalman filter for velocity and push attributes the
 remaining acceleration to the push; the trim is the part of the lean that the velocity error does not explain. The model
@@ -64,7 +64,7 @@ class Predicted:
     moved: Array  #: distance moved since the last feedback, (2,) [m]
     velocity: Array  #: velocity, (2,) [m/s]
     push: Array  #: acceleration caused by the air, (2,) [m/s²]
-    trim: Array  #: acceleration that the loop demands in addition to the velocity error's, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop demands in addition to that for the velocity error, (2,) [m/s²]
 
 
 class VelocityResponse:

@@ -175,7 +175,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route after checking that all numbers are in range, also in routes built by a program."""
+    """Return the route after checking that all numbers are in range, even if a program built the route."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -258,7 +258,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
-    """Check a route against a drone's newest feedback and parameters; waits for the proxy's answer.
+    """Check a route against a drone's newest feedback and parameters. This waits for the proxy's answer.
 
     An observer's connection is enough. The check waits up to ``wait_s`` for the first position.
     """

@@ -110,7 +110,7 @@ class RouteLaw:
 
     @property
     def goal(self) -> Waypoint:
-        """The next waypoint, or the one the vehicle is at."""
+        """The next waypoint, or the waypoint that the vehicle is at."""
         return self._goals[self.index].goal
 
     # Requests ---------------------------------------------------------------------------------------------------

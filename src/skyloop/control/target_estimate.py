@@ -9,8 +9,8 @@ cue, a nominal initial range is assumed. All ranges are then proportional to thi
 keeps the apparent size constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision
 based GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013).
 
-Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level them, so
-that the vehicle's roll and pitch don't move an object. For an edge outside the image, only a bound is known.
+Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level the
+directions, so that the vehicle's roll and pitch don't move an object. Edges outside the image only give bounds.
 """
 
 from __future__ import annotations
@@ -191,8 +191,8 @@ class Traits:
     radius_m: float = 0.0  #: distance from the target's centre to its visible lower edge
     #: intensity of the random acceleration; its square root is the typical velocity change in one second
     intensity_m2_s3: float = 1.0
-    #: Whether the target is on the ground. If None, this is assumed for targets with a class; for others it is one of
-    #: several hypotheses (:mod:`.target_range`).
+    #: Whether the target is on the ground. If None, targets with a class are assumed to be on the ground; for others
+    #: this is one of several hypotheses (:mod:`.target_range`).
     on_ground: bool | None = None
 
     def __post_init__(self) -> None:
@@ -249,7 +249,7 @@ class TargetEstimator:
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
         """Initialise the filter; ``nominal_m`` is the initial range if there is no cue.
 
-        With ``relative``, the vehicle's own velocity comes from dead reckoning, and its changing error adds to the
+        With ``relative``, the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
         target's motion.
         """
         self.traits = traits  #: prior knowledge about the target

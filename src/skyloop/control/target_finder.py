@@ -3,8 +3,8 @@
 The finder uses no drone, thread or clock; call it from one thread only. The tracker
 (:class:`skyloop.vision.LongTermTracker`) models the target's appearance, and the scene (:mod:`.target_scene`) models
 where all objects are and how they move. Each can find the target when the other fails. To avoid confusion, the
-tracker's box must be where the target can be. After a loss, a new object must also be there and be the only one that
-looks like the target.
+tracker's box must be where the target can be. After a loss, a new object must also be where the target can be, and must
+be the only one that looks like the target.
 """
 
 from __future__ import annotations

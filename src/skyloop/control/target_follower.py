@@ -55,21 +55,21 @@ class FollowStatus:
     range_m: float | None = None  #: horizontal distance from the camera to the target
     range_deviation_m: float | None = None
     bearing_rad: float | None = None  #: angle to the target, counter-clockwise from straight ahead
-    speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own
+    speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own speed
     lost_s: float = 0.0  #: time since the last sighting; 0 while the target is in view or before the first sighting
     problem: str = ""  #: why the target can't be followed as requested; empty if it can
     unknown: str = ""  #: unknown part of the vehicle's motion, which makes it hover regardless of the set-point
 
 
 class TargetFollower(AirframeLaw):
-    """Follows a target; to be called from one thread only."""
+    """Follows a target. Call its methods from one thread only."""
 
     def __init__(
         self,
         camera: CameraInfo,  # the camera, including its mounting; it must face forward
         *,
         box: Box | None = None,  # box of the target in the first frame given to :meth:`look`: x, y, width, height [px]
-        # class whose largest object to follow if there is no box; requires detections
+        # if there is no box, the largest object of this class is followed; requires detections
         class_name: str | None = None,
         mode: FollowMode = FollowMode.FOLLOW,  # how to follow the target
         detector: ObjectDetector | None = None,  # detector for every frame, on the thread that calls :meth:`look`
@@ -320,7 +320,7 @@ class FollowTarget(Behaviour):
         Args:
             drone: The drone to fly.
             box: Box of the target in the first frame: x, y, width, height [px].
-            class_name: Class whose largest object to follow if there is no box; requires a detector.
+            class_name: If there is no box, the largest object of this class is followed; requires a detector.
             distance_m: Horizontal distance to keep; None for the distance in the settings.
             bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
                 ahead of it, π behind it. If None, the settings apply, which allow any side by default.

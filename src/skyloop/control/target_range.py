@@ -5,10 +5,10 @@ only if the target is on the ground: a picture on a wall whose lower edge is jus
 and the filter would be overconfident. Being on the ground is therefore only one of several hypotheses. The others
 assume ranges from near to far, and each has its own filter (T. R. Kronhamn, "Bearings-only target motion analysis based
 on a multihypothesis Kalman filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE
-Proceedings 142(1), 1995). While the vehicle is at rest, all hypotheses fit. Once it has moved, hypotheses with a wrong
-range no longer fit. Vertical motion works best, because targets hardly move vertically. An altimeter that drifts or
-passes over rising ground reports motion that did not happen. For a target that may be off the ground, the camera's
-height is therefore taken from the vehicle's own climb and follows the altimeter only slowly.
+Proceedings 142(1), 1995). While the vehicle is at rest, all hypotheses fit. Once the vehicle has moved, hypotheses with
+a wrong range no longer fit. Vertical motion works best, because targets hardly move vertically. An altimeter that
+drifts or passes over rising ground reports motion that did not happen. For a target that may be off the ground, the
+camera's height is therefore taken from the vehicle's own climb and follows the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OF_LATE_S: Final = 2.0  # averaging time for the recent position
 _BASELINE: Final = 0.015  # minimum ratio of the vehicle's displacement to the range before the range is known
 _JUMP_M: Final = 0.15  # maximum sudden change of the vehicle's height ...
 _JUMP_M_S: Final = 1.0  # ... plus this per second; beyond that, the altimeter sees another surface
-_JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter takes for a jump
+_JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter needs to follow a jump
 _STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter if the climb is known
 _APART_M: Final = 3.0  # maximum deviation of altimeter and climb; if larger, the climb is no longer valid
 
@@ -251,7 +251,7 @@ def _off_climb(camera: Camera) -> float:
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Create a filter for a target, not started yet; ``class_name`` is None for a box drawn by a user."""
+    """Create an unstarted filter for a target; ``class_name`` is None for a box drawn by a user."""
     if traits is not None and (class_name is not None or traits.on_ground is not None):
         return TargetEstimator(traits, nominal_m=nominal_m, relative=relative)
     return RangeEstimator(traits or UNKNOWN, nominal_m=nominal_m, relative=relative)

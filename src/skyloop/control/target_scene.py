@@ -3,7 +3,7 @@
 Detections are matched with filtered estimates of the objects' current positions, not with their positions in the last
 image. The vehicle's own motion therefore does not matter, and look-alikes are distinguished by position and motion. The
 pairs form the most likely overall assignment (SciPy's ``linear_sum_assignment``). If two objects explain a detection
-almost equally well, it updates neither. Both then continue on their predicted paths until they separate.
+almost equally well, neither is updated. Both then continue on their predicted paths until they separate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 
 _COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b; lighting affects L most
 _OTHER: Final = 10.0  # colour difference between objects; for the same object it is usually below 0.5, sometimes 3
-_OTHER_AGAIN: Final = 3.0  # the same for an object that was briefly out of view
+_OTHER_AGAIN: Final = 3.0  # colour difference above which an object that was briefly out of view counts as another
 _MOMENT_S: Final = 0.3  # time out of view after which _OTHER_AGAIN applies
 _UNLIKE: Final = 3.0  # weight of the colour difference relative to the position
 _LEARNING: Final = 0.05  # learning rate of the colours per detection; the first few are averaged
@@ -137,7 +137,7 @@ def _is_about(thing: SceneObject, at_ns: int) -> bool:
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Return whether a detection may show two objects: the other one's centre is in the box and not far behind."""
+    """Return whether a detection may show two objects, because another's centre is in the box and not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box

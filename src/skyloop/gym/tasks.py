@@ -154,7 +154,7 @@ class Reaching:
 
     @property
     def arena(self) -> Arena:
-        """The drones. Raises :class:`UsageError` before :meth:`begin`."""
+        """The drones. Raises :class:`UsageError` if :meth:`begin` has not been called."""
         if self._arena is None:
             raise UsageError("the environment has not been reset yet: call reset() first")
         return self._arena
@@ -172,7 +172,7 @@ class Reaching:
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
         """Choose a new start and a new goal for these drones."""
-        self.age[which] = 0  # must precede the call of ``_place``, because moving goals depend on the age
+        self.age[which] = 0  # must precede the call to ``_place``, because moving goals depend on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)

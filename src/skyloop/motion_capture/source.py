@@ -271,8 +271,7 @@ def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[flo
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Command of the child process. If run with ``-m``, Python would warn that the package has already imported this
-#: module.
+#: Command of the child process. If run with ``-m``, Python would warn that the module is already imported.
 WORKER: Final = (
     sys.executable,
     "-c",
@@ -280,7 +279,7 @@ WORKER: Final = (
 )
 AGAIN_S: Final = 0.5  #: delay before restarting a child process that ended
 SILENT_S: Final = 3.0  #: time without frames after which a child is killed, because its system may have restarted
-FIRST_S: Final = 10.0  #: the same limit for a child's first frame
+FIRST_S: Final = 10.0  #: the same limit while waiting for a child's first frame
 
 
 class ChildSource:

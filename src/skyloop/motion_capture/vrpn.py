@@ -174,7 +174,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest pose of each body, given poses in order of arrival; others are named ``TRACKER:SENSOR``."""
+        """Return the newest pose of each body, given poses in order of arrival; other bodies are ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
@@ -194,7 +194,7 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Return whether all reporting trackers have had time to show if they have several sensors."""
+        """Return whether all reporting trackers have had time to reveal whether they have several sensors."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property

@@ -55,7 +55,7 @@ class Worker:
 
 
 class Group:
-    """Several children running the same command. A context manager that ends them."""
+    """Several children running the same command. Leaving its ``with`` block ends them."""
 
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S

@@ -97,7 +97,7 @@ class LongTermTracker(Tracker):
         self._tracker = tracker()
 
     def shift(self, right: float, down: float) -> None:
-        """Look for the target shifted by this much to the right and down in the next image [px]. Ignored while lost."""
+        """Look for the target shifted by this much to the right and down in the next image [px]. Ignored if lost."""
         if self._shape is not None and self._state is not _State.LOST:
             self._tracker.shift(right, down)
 
@@ -170,7 +170,7 @@ class LongTermTracker(Tracker):
         return TrackResult(seen.box, seen.similarity, confidence(seen.similarity))
 
     def _doubt(self, seen: Candidate | None) -> TrackResult:
-        """Keep an unverified target for a while, but immediately drop one that is on trial or clearly a look-alike."""
+        """Keep an unverified target for a while, but immediately drop a target on trial or a clear look-alike."""
         self._count += 1
         mistaken = seen is not None and _is_other(seen)
         if self._state is _State.ON_TRIAL or mistaken or self._count >= _PATIENCE:
@@ -295,8 +295,7 @@ class TargetMemory:
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
         """Search the whole image for the target [px], using another of its appearances each time.
 
-        Return up to three of the best places, most similar first, without those that overlap ``besides`` by more than a
-        tenth.
+        Return up to three of the best places, most similar first. Their overlap with ``besides`` is less than a tenth.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
         rows, columns = image.shape[:2]

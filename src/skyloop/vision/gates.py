@@ -65,7 +65,7 @@ class ColourMask:
 
 @dataclass(frozen=True, slots=True)
 class BlobSighting:
-    """One object of a colour in one image."""
+    """One object of a given colour in one image."""
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: angle of the left edge from the optical axis, positive to the left

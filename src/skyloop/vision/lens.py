@@ -30,8 +30,8 @@ def checked(
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
     """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
 
-    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
-    wrong shape or type, an empty array, or missing intrinsics.
+    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. Raise UsageError
+    if the shape or type is wrong, the array is empty, or the intrinsics are missing.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -152,7 +152,7 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
     """Return the ideal pinhole's focal length; ``balance`` 0 keeps only valid pixels, and 1 keeps the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
-    reach = []  # for each side: distance from the axis in pixels, divided by its least and by its greatest direction
+    reach = []  # for each side: pixels from the axis, divided by the smallest and by the largest direction along it
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
         side = np.full((len(along), 2), at)
         side[:, 1 - axis] = along

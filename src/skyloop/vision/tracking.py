@@ -1,11 +1,11 @@
 """Trackers that follow a box from image to image by a correlation filter, by the flow of points, or by a network.
 
 **Correlation.** The tracker learns a filter whose correlation with the patch around the target peaks sharply at the
-patch's centre. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using
-adaptive correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the
-target (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37,
-2015; its linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan,
-Häger, Khan and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
+patch's centre. The correlation is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object
+tracking using adaptive correlation filters", CVPR 2010), over several channels of gradients and colours and a patch
+larger than the target (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation
+filters", TPAMI 37, 2015; its linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17
+sizes (Danelljan, Häger, Khan and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
 2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half of the points that
@@ -122,7 +122,7 @@ class Tracker(ABC):
         """Report how far the camera's rotation has moved the target since the last image [px].
 
         The tracker looks for the target there in the next image. Trackers that search everywhere or measure the image's
-        motion themselves ignore this. Calling it is optional.
+        motion themselves ignore this. Calls to this method are optional.
         """
 
     @abstractmethod
@@ -135,7 +135,7 @@ class Tracker(ABC):
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
-    """Return a tracker's initial box; UsageError if malformed, too small, or less than half in the image."""
+    """Return a tracker's initial box; raise UsageError if malformed, too small, or less than half in the image."""
     try:
         x, y, width, height = (float(part) for part in box)
     except (TypeError, ValueError):
@@ -178,7 +178,7 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
     right, bottom = min(columns, math.ceil(x + width) + 1), min(rows, math.ceil(y + height) + 1)
     left, top = min(left, columns - 1), min(top, rows - 1)
     part = image[top : max(bottom, top + 1), left : max(right, left + 1)]
-    # Linear sampling uses only the nearest pixels, so average a large area down first.
+    # Linear sampling uses only the nearest pixels, so shrink a large area by averaging first.
     coarse = [max(1, int(full / wanted)) for full, wanted in zip((width, height), size, strict=True)]
     high, wide = part.shape[:2]
     if max(coarse) > 1:
@@ -463,7 +463,7 @@ class MedianFlowTracker(Tracker):
         return found, min(score, 1.0)
 
     def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return the points' new positions, how far off each is after tracking back, and which were tracked."""
+        """Return the points' new positions, their errors after tracking back, and which of the points were tracked."""
         cv = self._cv
         points = before.reshape(-1, 1, 2)
         after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
