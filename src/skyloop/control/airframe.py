@@ -74,11 +74,11 @@ class Motion:
         return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
-        """Add a fraction of the current velocity error to a wanted velocity.
+        """Add a fraction of the current velocity error to a desired velocity.
 
         Args:
-            wanted: The wanted velocity in odometry axes, (3,) [m/s].
-            share: Fraction of the difference between the wanted and the current velocity to add; 0 or more.
+            wanted: The desired velocity in odometry axes, (3,) [m/s].
+            share: Fraction of the difference between the desired and the current velocity to add; 0 or more.
         """
         return wanted + share * (wanted - self.velocity)
 
@@ -170,7 +170,7 @@ class Airframe:
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """Return the motion at a time [ns], extrapolated from the nearest sample; None if it is unknown."""
+        """Return the motion at a given time [ns], extrapolated from the nearest sample; None if it is unknown."""
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -253,7 +253,7 @@ class TiltVelocity:
             feedback: The vehicle's newest state; a landed vehicle is taken to be at rest.
 
         Returns:
-            The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None without an attitude.
+            The velocity forward, left, up (0) in the levelled body's axes [m/s]; None if the attitude is unknown.
         """
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
         if roll is None or pitch is None or yaw is None:
@@ -318,7 +318,7 @@ class AirframeLaw:
         return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the motion at a time; the caller must have checked that it is known."""
+        """Return the motion at a given time; the caller must have checked that the motion is known."""
         motion = self.airframe.at(at_ns)
         assert motion is not None, "a law without its motion is not ready"
         return motion
@@ -377,7 +377,7 @@ def _finite(feedback: Feedback) -> Feedback:
 
 
 class TurningSearch:
-    """A search with a forward-facing camera: turns on the spot and changes the height after each full turn."""
+    """Searches with a forward-facing camera: turns on the spot and changes height after each full turn."""
 
     def __init__(
         self,
@@ -417,7 +417,7 @@ class TurningSearch:
 
         Args:
             yaw: Yaw of the vehicle [rad].
-            altitude: Height above the ground [m]; None keeps the current height.
+            altitude: Height above the ground [m]; None to keep the current height.
 
         Returns:
             Forward, left, up [m/s] and yaw rate [rad/s], (4,).

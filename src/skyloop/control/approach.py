@@ -207,11 +207,12 @@ class OrbitPlace(FollowPath):
 class LandOnMarker(Behaviour):
     """Searches for a marker in a spiral, descends above it, following its motion, and stops the motors after landing.
 
-    If the marker is lost during the approach, the vehicle climbs at its predicted position, then searches for it. When
-    the vehicle is so low that the marker no longer fits into the image, it descends using the marker's predicted
-    motion; if it would miss, it aborts and tries again. After too many aborts or too long a time, it climbs to a safe
-    height and hovers, and :meth:`run` returns with :attr:`landed` false. :attr:`landed` is also false if another client
-    lands it. The vehicle must be airborne when :meth:`run` is called; it hovers in place if :meth:`run` ends early.
+    If the marker is lost during the approach, the vehicle climbs at its predicted position, then searches for the
+    marker. When the vehicle is so low that the marker no longer fits into the image, it descends using the marker's
+    predicted motion; if it would miss, it aborts and tries again. After too many aborts or too long a time, it climbs
+    to a safe height and hovers, and :meth:`run` returns with :attr:`landed` false. :attr:`landed` is also false if
+    another client lands it. The vehicle must be airborne when :meth:`run` is called; it hovers if :meth:`run` ends
+    early.
 
     Attributes:
         marker_id: ID of the marker.

@@ -94,7 +94,7 @@ class ChaseSettings:
     velocity_gain: float = 3.0  #: acceleration per unit of velocity error [1/s]
     yaw_gain: float = 2.2  #: [1/s]
     height_gain: float = 1.0  #: [1/s]
-    round_gain: float = 1.2  #: gain of moving around to ``bearing_rad`` [1/s]
+    round_gain: float = 1.2  #: gain for moving around to ``bearing_rad`` [1/s]
     #: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
     speed_m_s: float = 4.0
     climb_m_s: float = 0.6  #: maximum vertical speed
@@ -183,7 +183,7 @@ class ChaseLaw:
         self.settings = settings or ChaseSettings()  #: settings, which can be replaced in flight
         self.mode = mode  #: pursuit mode, which can be changed in flight
         self.phase = TargetPhase.LOOKING  #: phase at the last step
-        #: estimated minus wanted distance at the last step; None if the distance was not controlled
+        #: estimated minus desired distance at the last step; None if the distance was not controlled
         self.off_m: float | None = None
         self.held_by = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
         self._heading: float | None = None  # last known direction of the target's motion
@@ -208,7 +208,7 @@ class ChaseLaw:
         self,
         now_ns: int,  # the current time on the proxy's clock
         motion: Motion,  # the vehicle's newest motion, from dead reckoning if ``relative``
-        altitude_m: float | None,  # height above the ground; None leaves the height unchanged
+        altitude_m: float | None,  # height above the ground; None to leave the height unchanged
         target: TargetEstimator | None,  # the target's filter; None before the first sighting
         seen_ns: int | None,  # time of the target's last certain or possible sighting; None if there was none
         others: Sequence[TargetState] = (),  # recently seen objects to keep clear of
@@ -354,7 +354,7 @@ class ChaseLaw:
         return turn
 
     def _horizontal(self, own: Motion, state: TargetState) -> Array:
-        """Return the wanted velocity, (2,) in odometry axes [m/s]."""
+        """Return the desired velocity, (2,) in odometry axes [m/s]."""
         s = self.settings
         offset = state.foot[:2] - own.position[:2]
         across = max(0.3, float(np.hypot(*offset)))
@@ -362,14 +362,14 @@ class ChaseLaw:
         aside = np.array([-sight[1], sight[0]])
         near = max(0.3, across - state.margin_m)
         self.off_m = near - s.distance_m
-        # Approach only as fast as the vehicle can stop; back off at the speed given by the gain.
+        # Approach only at a speed from which the vehicle can stop; back off at the speed given by the gain.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
         moving = self._soon(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
             wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above, with the target on the left
         elif s.bearing_rad is None:
-            # With no side chosen, only the yaw follows the target's motion across the line of sight.
+            # If no side is chosen, only the yaw follows the target's motion across the line of sight.
             wanted = wanted - aside * float(moving @ aside)
         else:
             wanted = wanted + aside * self._round(state, sight, across)
@@ -377,7 +377,7 @@ class ChaseLaw:
         return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
-        """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle has matched it."""
+        """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle will have matched it."""
         s, velocity = self.settings, state.velocity
         if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
             dt_s = seconds(at_ns - self._previous_velocity[0])
@@ -418,7 +418,7 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
         The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
-        position is uncertain, for example out of view, the vehicle stays further away and assumes that it may stop.
+        position is uncertain, the vehicle stays further away and assumes that the object may stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m

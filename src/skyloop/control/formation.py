@@ -46,7 +46,7 @@ def line(n: int, spacing_m: float) -> Places:
 
 
 def column(n: int, spacing_m: float) -> Places:
-    """Return a column of drones behind one another, the first at the front.
+    """Return a column of drones behind one another, with the first drone at the front.
 
     Args:
         n: Number of drones.
@@ -100,7 +100,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours in a row and between rows.
-        columns: Number of drones per row; None makes the grid as square as possible.
+        columns: Number of drones per row; None to make the grid as square as possible.
 
     Raises:
         UsageError: An argument is out of range.

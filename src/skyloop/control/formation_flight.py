@@ -95,9 +95,8 @@ class Formation:
         Args:
             slots: Positions in world axes, (n, 3) [m]; at least one for each drone.
             speed_m_s: Maximum speed of the drone that has the longest path.
-            yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Time after which drones that are not at their slots have failed; None allows 10 s more than
-                planned.
+            yaw: Yaw of all drones [rad]; None to leave it free.
+            timeout_s: Time after which drones not yet at their slots have failed; None for 10 s more than planned.
 
         Returns:
             A report with the drones' final positions and how close they came to each other.

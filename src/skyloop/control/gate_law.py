@@ -1,4 +1,4 @@
-"""A control law for flying through a gate, and a planner for the shortest way around posts and gates. Pure.
+"""A control law for flying through a gate, and a planner for the shortest path around posts and gates. Pure.
 
 The law uses position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4),
 2006) to compute velocities from sightings and feedback. The gate's position and axis are stored in odometry axes, where
@@ -258,7 +258,7 @@ def _shortest(points: Array, lengths: Array) -> list[Point] | None:
 
 
 def _distances(begin: Array, end: Array, walls: Array) -> Array:
-    """Return the distances (n, m) between n segments, given by ends (n, 2), and m walls (m, 2, 2)."""
+    """Return the distances (n, m) between n segments, given by their ends (n, 2), and m walls (m, 2, 2)."""
     a, b = begin[:, None], end[:, None]
     c, d = walls[None, :, 0], walls[None, :, 1]
     apart = np.minimum(

@@ -85,7 +85,7 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that makes a level camera's points (n, 2) converge exponentially to their wanted positions.
+    """Compute the motion that makes a level camera's points (n, 2) converge exponentially to their goals.
 
     The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`): forward, left, up [m/s] and yaw
     rate [rad/s], (4,). The gain is in 1/s.
@@ -122,7 +122,7 @@ class ServoSettings:
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.0
     acceleration_m_s2: float = 2.0
-    fresh_s: float = 0.3  #: time to carry on without a sighting
+    fresh_s: float = 0.3  #: time to continue without a sighting
     holding_s: float = 2.0
     search_rad_s: float = 0.7
 
@@ -144,7 +144,7 @@ class ImageServoLaw(VelocityLaw):
         )
         super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING  #: phase at the last step
-        self.error = math.inf  #: RMS distance between the points and their wanted positions in the plane at z = 1
+        self.error = math.inf  #: RMS distance between the points and their desired positions in the plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
         self._depth_m = depth_m
@@ -195,7 +195,7 @@ class ImageServoLaw(VelocityLaw):
 class ImageServo(Behaviour):
     """Flies to where a marker appears as seen from ``distance_m`` straight in front of it, and holds that position.
 
-    Control works purely in the image: the marker's size is only used to compute the wanted image. Runs until stopped.
+    Control works purely in the image: the marker's size only serves to compute the desired image. Runs until stopped.
     """
 
     name = "servo"
@@ -217,7 +217,7 @@ class ImageServo(Behaviour):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             marker_id: ID of the marker.
-            distance_m: Wanted distance straight in front of the marker.
+            distance_m: Desired distance straight in front of the marker.
             size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: A forward-facing camera; None for the vehicle's first camera.
@@ -246,7 +246,7 @@ class ImageServo(Behaviour):
 
     @property
     def error_px(self) -> float:
-        """RMS distance between the corners and their wanted positions [px]; infinite before the first sighting."""
+        """RMS distance between the corners and their desired positions [px]; infinite before the first sighting."""
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -310,7 +310,7 @@ class FlowLaw(AirframeLaw):
     """Computes attitudes from horizontal positions. Pure; times are on the proxy's clock [ns].
 
     A PID controller for each axis computes the acceleration from the position, its integral and the velocity. The
-    velocity comes from a constant-velocity filter over the positions, not from the vehicle.
+    velocity comes from a constant-velocity filter applied to the positions, not from the vehicle.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
@@ -345,7 +345,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the current set-point. While the position is unknown, the attitude is level, without braking."""
+        """Compute the current set-point. While the position is unknown, the vehicle is level and not braked."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None

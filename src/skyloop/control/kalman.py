@@ -56,7 +56,7 @@ class TurnEstimate:
     position: Array  #: position, (3,) [m]
     velocity: Array  #: velocity, (3,) [m/s]
     turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise as seen from above [rad/s]
-    extra: Array  #: horizontal acceleration in addition to that of the turn, (2,) [m/s²]
+    extra: Array  #: horizontal acceleration in addition to the turn's, (2,) [m/s²]
     covariance: Array  #: covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7)
 
     @property
@@ -125,7 +125,7 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether the position was used. False means that it was outside the gate (counted in :attr:`refused`) or old.
+            Whether the position was used: it must be inside the gate (see :attr:`refused`) and not too old.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
@@ -143,7 +143,7 @@ class _Filter(ABC, Generic[_E]):
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict the estimate for a time; for times before the last measurement, return the last estimate.
+        """Predict the estimate for a given time; for times before the last measurement, return the last estimate.
 
         Args:
             at_ns: Time of the prediction.

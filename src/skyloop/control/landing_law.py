@@ -4,9 +4,9 @@ A filter for straight motion and steady turns (:mod:`.kalman`) tracks the marker
 its own motion (:mod:`.response`), the vehicle flies to where the marker will be when the set-point takes effect and
 matches its velocity and acceleration. It descends while it is inside a cone above the marker, as in Saripalli,
 Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the
-cone it first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the image, the
-vehicle flies by prediction. If the vehicle would touch down too far from the marker, it aborts and climbs along the
-marker's predicted path. After a number of aborted attempts it gives up and hovers at a safe height.
+cone, the vehicle first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the
+image, the vehicle flies by prediction. If the vehicle would touch down too far from the marker, it aborts and climbs
+along the marker's predicted path. After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class LandingSettings:
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
     #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
-    #: ``blind_s``. Just above it (below ``nearly_m``), it is aborted only if the vehicle would miss the platform.
+    #: ``blind_s``. Just above the marker (below ``nearly_m``), only a miss of the platform aborts it.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
@@ -86,7 +86,7 @@ class LandingSettings:
     touch_m: float = 0.03  #: height below which the vehicle counts as touched down
     feet_m: float = 0.06  #: distance of the feet below the body's centre
 
-    #: Marker speed above which the image's longer side is aligned with its motion, to see it for longer.
+    #: Marker speed above which the image's longer side is aligned with its motion, to keep it in view for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
     long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
@@ -417,7 +417,7 @@ class LandingLaw(AirframeLaw):
 
 
 def _then(newest: Motion, ahead: Predicted) -> Motion:
-    """Return the vehicle's motion when a set-point sent now takes effect."""
+    """Return the vehicle's predicted motion at the time when a set-point sent now takes effect."""
     dt = seconds(ahead.at_ns - newest.at_ns)
     position = newest.position + np.array([*ahead.moved, newest.velocity[2] * dt])
     velocity = np.array([*ahead.velocity, newest.velocity[2]])
@@ -445,7 +445,7 @@ class SpiralSearch:
         self._leg, self._goal = 0, None
 
     def step(self, position: Array) -> Array:
-        """Return the wanted velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
+        """Return the desired velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
         if self._goal is None:
             self._begin = self._goal = position.copy()
         way = self._goal - position

@@ -104,7 +104,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Restart from a set-point; with None, the next change is not limited."""
+        """Restart from a set-point; if it is None, the next change is not limited."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

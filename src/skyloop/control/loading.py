@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache can't tell files of the same size and second apart."""
+    """Always compiles the source, because Python's cache confuses files with the same size and second."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -180,7 +180,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Reload the file and the modules in its folder; on failure, restore those loaded before."""
+        """Reload the file and the modules in its folder; on failure, restore the previously loaded modules."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -213,7 +213,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None if the file is missing, as while it is being replaced."""
+    """Return a stamp that changes with each save; None if the file is missing, for example during a save."""
     try:
         found = file.stat()
     except OSError:

@@ -35,7 +35,7 @@ _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
 _SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
 _ALONG_M_S = 0.05  # minimum speed for the direction of flight to determine the yaw
 _NEAR_M = 0.3  # minimum horizontal distance to a point for its bearing to be reliable
-_AHEAD_S = 0.1  # interval for computing the rate of the wanted yaw
+_AHEAD_S = 0.1  # interval for computing the rate of the desired yaw
 
 
 class YawMode(Protocol):
@@ -150,7 +150,7 @@ class PathLaw:
         Args:
             path: The path, in world axes.
             settings: Settings for the control law; None for the defaults.
-            yaw: The yaw mode; None keeps the yaw of the first fix.
+            yaw: The yaw mode; None to keep the yaw of the first fix.
         """
         self.settings = settings or PathSettings()
         self.time_s = 0.0  #: current time on the path
@@ -162,7 +162,7 @@ class PathLaw:
         self._limiter = SetpointLimiter(limits)
         self._last: Fix | None = None
         self._wanted_yaw: float | None = None
-        self._turning = 0.0  # rate of the wanted yaw [rad/s]
+        self._turning = 0.0  # rate of the desired yaw [rad/s]
 
     @property
     def over(self) -> bool:
@@ -179,20 +179,20 @@ class PathLaw:
 
         Args:
             path: The path, in world axes.
-            yaw: The new yaw mode; None keeps the current one.
+            yaw: The new yaw mode; None to keep the current one.
         """
         self._path, self.time_s = path, 0.0
         if yaw is not None:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Pause the path because the vehicle hovers or another client flies it; restart at rest, with integral 0."""
+        """Pause the path because the vehicle hovers or another client flies it; restart at rest, with no integral."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None
 
     def there(self, fix: Fix) -> bool:
-        """Return whether the path's time is up and the vehicle is at its end with the wanted yaw."""
+        """Return whether the path's time is up and the vehicle is at its end with the desired yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
@@ -229,7 +229,7 @@ class PathLaw:
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 
     def _turn(self, fix: Fix) -> float:
-        """Return the wanted yaw rate [rad/s]."""
+        """Return the desired yaw rate [rad/s]."""
         position, velocity = self.target
         if self._yaw is not None:
             later = self.time_s + _AHEAD_S
@@ -241,7 +241,7 @@ class PathLaw:
         return self._turning + self.settings.yaw_gain * wrap_angle(self._wanted_yaw - fix.yaw_rad)
 
 
-APPROACH_M_S: Final = 0.5  #: speed on the way to the start of a path
+APPROACH_M_S: Final = 0.5  #: speed while flying to the start of a path
 
 
 @dataclass(slots=True)
@@ -367,7 +367,7 @@ class FollowPath(_PathFlyer):
         Args:
             drone: The drone to fly.
             path: The path, in world axes.
-            yaw: A :class:`skyloop.control.YawMode`; None keeps the current yaw.
+            yaw: A :class:`skyloop.control.YawMode`; None to keep the current yaw.
             settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
             max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.
@@ -428,7 +428,7 @@ class Waypoints(_PathFlyer):
             speed_m_s: Maximum speed between waypoints.
             acceleration_m_s2: Acceleration at the start and end of each leg.
             hold_s: Time to stay at each waypoint.
-            yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None keeps the current yaw.
+            yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None to keep the current yaw.
             settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
             max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.

@@ -114,7 +114,7 @@ class Pid:
         """Compute the output for a new measurement.
 
         Args:
-            set_point: The wanted value.
+            set_point: The desired value.
             measured: The measured value, in the same unit.
             dt_s: Time since the last measurement [s].
             feed_forward: Value added to the output before the limits are applied.
@@ -182,7 +182,7 @@ class VectorPi:
         """Initialise the controller.
 
         Args:
-            gains: The gains, of which the derivative gain and ``tracking_s`` are unused.
+            gains: The gains; the derivative gain and ``tracking_s`` are not used.
             dimensions: Length of the vector.
             most: Maximum magnitude of the integral term.
         """

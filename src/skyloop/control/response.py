@@ -35,7 +35,7 @@ _KEPT_SETPOINTS = 64  # number of recent set-points to keep
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop, by default that of the AR.Drone according to public sources."""
+    """The response of a vehicle's velocity loop; the defaults describe the AR.Drone, from public sources."""
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
     lag_s: float = 0.1  #: time constant of the lean; Engel, Sturm and Cremers, IROS 2012, give a rate of 10 1/s
@@ -58,13 +58,13 @@ class ResponseSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The predicted motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
+    """The predicted motion when a set-point sent now takes effect. Axes are horizontal, with x along yaw 0."""
 
     at_ns: int  #: time at which the set-point takes effect
     moved: Array  #: distance moved since the last feedback, (2,) [m]
     velocity: Array  #: velocity, (2,) [m/s]
     push: Array  #: acceleration caused by the air, (2,) [m/s²]
-    trim: Array  #: acceleration that the loop demands in addition to that for the velocity error, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop demands in addition to its response to the velocity error, (2,) [m/s²]
 
 
 class VelocityResponse:

@@ -72,7 +72,7 @@ class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
 
 
 class Photo(_Part, frozen=True, tag_field="do", tag="photo"):
-    """Save a frame from a camera, by default from the vehicle's first one."""
+    """Save a frame from a camera, by default the vehicle's first camera."""
 
     camera: Name | None = None
 
@@ -87,7 +87,7 @@ class RouteWaypoint(_Part, frozen=True):
     y: Metres  #: north [m]
     z: Metres  #: up [m]
     speed: Speed | None = None  #: maximum speed to this waypoint [m/s]; None for the route's speed
-    yaw: Angle | None = None  #: yaw to turn to before arrival [rad]; None keeps the current yaw
+    yaw: Angle | None = None  #: yaw to turn to before arrival [rad]; None to keep the current yaw
     look_at: Point | None = None  #: point (x, y) [m] to face, as an alternative to a fixed yaw
     actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform, in order
 
@@ -121,7 +121,7 @@ class Route(_Part, frozen=True, kw_only=True):
     #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
     name: Name = ""  #: A human-readable name
-    speed: Speed = 0.5  #: maximum speed to waypoints without their own [m/s]
+    speed: Speed = 0.5  #: maximum speed to waypoints that don't set their own [m/s]
     #: what to do after the last waypoint: ``hover``, ``land`` or ``return`` (fly back to the start of the route at the
     #: last waypoint's height and land there)
     end: Literal["hover", "land", "return"] = "hover"
@@ -133,7 +133,7 @@ class Route(_Part, frozen=True, kw_only=True):
             raise UsageError("a route needs at least one waypoint")
 
     def speed_to(self, index: int) -> float:
-        """Return the maximum speed to a waypoint [m/s]; an index past the last waypoint means the way back."""
+        """Return the maximum speed to a waypoint [m/s]; an index past the last waypoint means the return flight."""
         own = self.waypoints[index].speed if index < len(self.waypoints) else None
         return self.speed if own is None else own
 

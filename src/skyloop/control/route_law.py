@@ -88,8 +88,8 @@ class RouteLaw:
     def __init__(self, route: Route) -> None:
         self.route = route
         self.state = RouteState.READY  #: state of the flight
-        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the way back
-        self.problem = ""  #: why the law paused without a request; empty otherwise
+        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the return flight
+        self.problem = ""  #: reason why the law paused without a request; otherwise empty
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
         self._arrived = False  # whether the vehicle has reached the waypoint and started the actions there

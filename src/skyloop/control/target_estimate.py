@@ -166,7 +166,7 @@ _LATE_S: Final = 0.5  # maximum age of a useful box
 _ADAPTING: Final = 0.3  # weight of a single box in the average surprise
 _USUAL: Final = 1.5  # maximum surprise that is still attributed to noise
 _MOST_SURPRISE: Final = 4.0  # maximum contribution of a single box to the average surprise
-_STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move straight on
+_STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move in a straight line
 _GONE_S: Final = 0.2  # minimum time out of view before a target counts as hidden ...
 _GONE_INTERVALS: Final = 2.5  # ... and the minimum time in intervals between boxes
 _BEFORE_S: Final = 0.2  # time before a loss at which boxes are assumed to be unoccluded
@@ -204,7 +204,7 @@ class Traits:
                 raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
 
 
-#: Traits by class name, with the typical spread of heights. A bus is not a car.
+#: Traits by class name, with the typical spread of heights. Buses and cars are separate classes.
 TRAITS: Final = {
     "person": Traits(height_m=1.74, height_share=0.06, radius_m=0.25, intensity_m2_s3=0.6),
     "car": Traits(height_m=1.45, height_share=0.2, radius_m=1.2, intensity_m2_s3=3.0),
@@ -360,7 +360,7 @@ class TargetEstimator:
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box and return whether it was used; boxes over half a second older than the newest are not.
+        """Update with a box and return whether it was used; ignore boxes over half a second older than the newest.
 
         Edges far from where they are expected count as hidden and are ignored. Boxes in other directions are refused.
         """
@@ -392,7 +392,7 @@ class TargetEstimator:
     def at(self, at_ns: int) -> TargetState:
         """Predict the target's state; motion continues for at most four seconds, but the uncertainty keeps growing.
 
-        For a hidden target, the motion shortly before the loss is used, because the occluder cut off its last boxes.
+        For a hidden target, the motion shortly before the loss is used, because the occluder cut off the latest boxes.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -416,7 +416,7 @@ class TargetEstimator:
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
-        """Return the predicted state and covariance for a time.
+        """Return the predicted state and covariance for a given time.
 
         For times shortly before the newest box (detections from other processes arrive late), the state is moved back
         and the covariance stays the same.

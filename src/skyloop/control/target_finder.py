@@ -34,7 +34,7 @@ _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for 
 _DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
 _LATELY_S: Final = 1.0  # time to keep clear of other objects after they were last seen
 _DORMANT_S: Final = 1.0  # time out of view after which the target must be recognised again
-_SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be it
+_SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be the target
 _LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
 _LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to determine the newcomer's motion
 _LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
@@ -255,7 +255,7 @@ class TargetFinder:
         return True
 
     def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
-        """Return whether the detector allows the tracker's box to be the target's.
+        """Return whether, according to the detector, the tracker's box may be the target's.
 
         The tracker may get stuck on an object that hides the target. If the detector knows the target, the tracker is
         therefore trusted only between searched images, and only for a second.
@@ -399,7 +399,7 @@ class TargetFinder:
         return unsure and not isinstance(thing.estimator, RangeEstimator)
 
     def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
-        """Return a filter that learns the range of an object in a frame; ``back`` means that a lost target is back."""
+        """Return a filter that learns the range of an object in a frame; ``back`` marks the return of a lost target."""
         before = self.estimator
         if isinstance(before, RangeEstimator) and not back:
             return before

@@ -74,7 +74,7 @@ class TargetFollower(AirframeLaw):
         mode: FollowMode = FollowMode.FOLLOW,  # how to follow the target
         detector: ObjectDetector | None = None,  # detector for every frame, on the thread that calls :meth:`look`
         detects: bool = False,  # whether detections from elsewhere arrive through :meth:`detected`
-        traits: Traits | None = None,  # prior knowledge about the target; None to use that of its class
+        traits: Traits | None = None,  # prior knowledge about the target; None to use the class's
         settings: ChaseSettings | None = None,  # settings for the control law; None for the defaults
     ) -> None:
         """Initialise the follower; raise UsageError if there is no target or the camera does not face forward."""
@@ -327,8 +327,8 @@ class FollowTarget(Behaviour):
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Detector that searches every frame, or the name of a processor that returns detections, such as
                 the one started by ``skyloop detect``. If None, the target is tracked by appearance only.
-            height_m: The target's height, if known, for estimating its distance; by default, that of its class. If
-                neither is available, the drone only turns until its own motion has revealed the range.
+            height_m: The target's height, if known, for estimating its distance; by default, the typical height of its
+                class. If neither is available, the drone only turns until its own motion has revealed the range.
             traits: All prior knowledge about the target, as an alternative to ``height_m``.
             camera: Camera to use; None for the vehicle's first camera.
             settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.

@@ -49,7 +49,7 @@ _JUMP_M: Final = 0.15  # maximum sudden change of the vehicle's height ...
 _JUMP_M_S: Final = 1.0  # ... plus this per second; beyond that, the altimeter sees another surface
 _JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter needs to follow a jump
 _STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter if the climb is known
-_APART_M: Final = 3.0  # maximum deviation of altimeter and climb; if larger, the climb is no longer valid
+_APART_M: Final = 3.0  # maximum difference between altimeter and climb; beyond it, the climb is no longer valid
 
 
 class RangeEstimator(TargetEstimator):
@@ -112,7 +112,7 @@ class RangeEstimator(TargetEstimator):
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
         """Update with a box, as in :meth:`TargetEstimator.update`, and drop hypotheses that no longer fit.
 
-        The filters restart if the measured height jumps, because someone walks under the vehicle, it flies over a table
+        The filters restart if the measured height jumps, because someone walks below, the vehicle flies over a table,
         or its height was unknown. Such apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:

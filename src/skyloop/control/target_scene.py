@@ -137,7 +137,7 @@ def _is_about(thing: SceneObject, at_ns: int) -> bool:
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Return whether a detection may show two objects, because another's centre is in the box and not far behind."""
+    """Return whether a detection may show two objects, because another object's centre is in it, not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box
@@ -153,7 +153,7 @@ class Scene:
     """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene; ``traits`` by class name replace those in :data:`~.target_estimate.TRAITS`."""
+        """Initialise an empty scene; ``traits`` maps classes to traits replacing :data:`~.target_estimate.TRAITS`."""
         self.objects: dict[int, SceneObject] = {}  #: objects by number
         self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
         #: numbers of objects that are not matched with detections, because their return is decided elsewhere

@@ -156,7 +156,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
     """Many drones in one simulation, which is many times faster than one simulation per drone.
 
-    Like :class:`TaskEnv`, with a leading axis; a finished episode starts over in the next step
+    Like :class:`TaskEnv`, but with a leading axis; a finished episode starts over in the next step
     (``AutoresetMode.NEXT_STEP``).
     """
 
@@ -231,7 +231,7 @@ class FollowEnv(TaskEnv):
 
 
 class GatesEnv(TaskEnv):
-    """Fly through four gates in order. The reward is 1 per gate and 1 per metre to the next; the last gate ends it."""
+    """Fly through four gates in order. Each gate and each metre of progress earns 1; the last gate ends the episode."""
 
     task = Racing
 

@@ -271,7 +271,7 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between a tracked body's axes and those of a drone that rests on the ground.
+        """Measure the rotation between a tracked body's axes and the axes of a drone that rests on the ground.
 
         Afterwards, poses of the body are converted to poses of the drone. Until then, an earlier calibration is used.
 

@@ -252,7 +252,7 @@ class Track:
         return self.pose
 
     def look(self, now_ns: int) -> bool:
-        """Update the state at a time [ns]; return whether the body has just been lost."""
+        """Update the state for a given time [ns]; return whether the body has just been lost."""
         if self.pose is None or now_ns - self.pose.captured_ns < nanoseconds(LOST_AFTER_S):
             return False
         self.state, self.pose = TrackState.LOST, None

@@ -46,7 +46,7 @@ TYPE_DESCRIPTION: Final = -2
 DISCONNECT: Final = -5
 POS_QUAT: Final = "vrpn_Tracker Pos_Quat"
 MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes: the buffer size of the reference implementation
-MAX_NAMES: Final = 2_000  #: maximum number of senders and types each, as in the reference implementation
+MAX_NAMES: Final = 2_000  #: maximum number of senders, and of types, as in the reference implementation
 MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 
 HEADER: Final = struct.Struct(">IIIiiI")

@@ -112,7 +112,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """Return the class of that name or, without a name, the only class with a method ``process``."""
+    """Return the class with the given name; if no name is given, return the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -168,7 +168,7 @@ class Output:
         """Combine a result with shapes to draw.
 
         Args:
-            value: The result; None publishes nothing.
+            value: The result; None to publish nothing.
             shapes: Shapes in the frame's pixels.
         """
         self.value = value
@@ -186,7 +186,7 @@ class Settings:
     name: str  #: name of the processor and of its results
     code: str  #: identifier of the code, the same for all workers
     camera: str | None = None  #: name of the camera; None for the vehicle's first camera
-    shared: bool = True  #: whether each frame goes to only one worker, instead of to all
+    shared: bool = True  #: whether each frame goes to only one worker rather than to all of them
     max_age_s: float | None = 1.0  #: maximum age of a frame when its turn comes; None for no limit
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
     stuck_s: float = 2.0  #: duration of a ``process`` call after which this worker's frames go to the others
@@ -296,7 +296,7 @@ class Worker:
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Return whether the worker can take frames, which it can't once a ``process`` call exceeds ``stuck_s``."""
+        """Return whether the worker can take frames: false once a ``process`` call takes longer than ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -318,7 +318,7 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._reported_refusal:  # further results are likely to have the same type
+        if not self._reported_refusal:  # later results are likely to have the same type
             self._reported_refusal = True
             self._emit(f"{self.settings.name}: {error}. Further ones are counted but not reported.")
 
@@ -416,7 +416,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     camera: str
     processes: int = 1  #: number of workers that these statistics cover
     part: int = 0  #: index of this worker's share of the frames; 0 if the statistics cover several workers
-    parts: int = 0  #: number of shares, 0 if there is none now; in statistics of several workers, how many have a share
+    parts: int = 0  #: number of shares, 0 if there are none; in statistics of several workers, workers with a share
     workers: int = 0  #: number of workers of this processor and camera that are known to the proxy
     frames: int = 0  #: number of frames in the worker's part
     results: int = 0

@@ -61,7 +61,7 @@ _GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:
-    """Return the estimated probability that a box with this score overlaps the target by half or more; monotone."""
+    """Return the estimated probability that a box with this score overlaps the target by half or more; monotonic."""
     return float(np.interp(score, [at for at, _ in _CONFIDENCE], [share for _, share in _CONFIDENCE]))
 
 
@@ -74,11 +74,11 @@ class _State(Enum):
 class LongTermTracker(Tracker):
     """Tracks a target, reports its loss, and finds it again anywhere in the image.
 
-    The target is followed by another tracker. Each of its boxes is compared with a memory of the target's appearances,
-    learned from boxes that match well, and with look-alikes seen near it. A box that is not verified is withheld and
-    the target reported as lost. After ten such images the whole image is searched, at one size per image. A place that
-    is similar enough, and clearly more similar than any other place or known look-alike, is tracked on trial and
-    returned after three images.
+    The tracking itself is done by another tracker. Each of its boxes is compared with a memory of the target's
+    appearances, learned from boxes that match well, and with look-alikes seen near it. A box that is not verified is
+    withheld and the target reported as lost. After ten such images the whole image is searched, at one size per image.
+    A place that is similar enough, and clearly more similar than any other place or known look-alike, is tracked on
+    trial and returned after three images.
 
     A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
     new box. The score is the similarity to the closest appearance; ``confidence`` is calibrated on simulated people.
@@ -293,7 +293,7 @@ class TargetMemory:
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Search the whole image for the target [px], using another of its appearances each time.
+        """Search the whole image for the target [px], using a different one of its appearances each time.
 
         Return up to three of the best places, most similar first. Their overlap with ``besides`` is less than a tenth.
         """

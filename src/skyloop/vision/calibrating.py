@@ -227,10 +227,10 @@ class Collector:
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
-        """Select a view if it shows the board in a new place, at a new distance or with a new tilt.
+        """Select a view if it shows the board at a new place, at a new distance or with a new tilt.
 
         Returns:
-            Whether it was selected.
+            Whether the view was selected.
         """
         mark = _mark(view)
         nearest = min((float(np.abs(mark - other).max()) for other in self._marks), default=math.inf)
@@ -360,7 +360,7 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """Return a fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
+    """Return OpenCV's fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 

@@ -66,7 +66,7 @@ class GroundTracker:
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
             at_capture: Feedback with the attitude and altitude at the time of capture.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too

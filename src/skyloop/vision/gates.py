@@ -30,7 +30,7 @@ _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance
 _FARTHEST_M: Final = 8.0  # maximum distance; anything further away is more likely a patch of the same colour
 _SIDE_SHARE: Final = 0.15  # fraction of each side left out at both ends, because corners look rounded
-_FILLED: Final = 0.6  # minimum fraction of the hull: similarly coloured objects behind may reach into the hole
+_FILLED: Final = 0.6  # minimum fraction of the hull; similarly coloured objects behind may reach into the hole
 _OFF_PX: Final = 1.5  # maximum RMS distance between the edge and its four sides
 _LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
 _SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
@@ -111,7 +111,7 @@ class BlobDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the widest first.
@@ -169,7 +169,7 @@ class GateDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the nearest first.
@@ -296,7 +296,7 @@ class PoleDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the widest first.

@@ -19,7 +19,7 @@ from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
 _WIDEST = 1e-9  # z divided by distance: a point with a smaller value is not in front of the camera
-_STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little besides its edges
+_STEEPEST = 3.0  # x/z at 72°; a wider ideal camera would show little but its edges
 _DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which the distortion is sampled
 _RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it back
 _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversion
@@ -117,7 +117,7 @@ def undistort(
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
-        intrinsics: Intrinsics of the camera; None uses the frame's own.
+        intrinsics: Intrinsics of the camera; defaults to the frame's own.
         balance: 0 shows only valid pixels; 1 shows everything that the camera saw, surrounded by black; values in
             between are allowed.
 
@@ -164,7 +164,7 @@ def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: floa
 
 
 def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z of a pinhole's pixels."""
+    """Return x/z and y/z for the pixels of a pinhole camera."""
     if not len(pixels):
         return np.empty((0, 2))
     cv, given = opencv("removing distortion"), pixels.reshape(-1, 1, 2)

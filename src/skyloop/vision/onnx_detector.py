@@ -1,10 +1,10 @@
 """Detectors of the YOLO and DETR families, loaded from a user's ONNX file and run on the CPU by ONNX Runtime.
 
 A network's family is recognised by the layout of its outputs.
-YOLOv5 and v7 return rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 the same, transposed and
-without objectness; YOLOv10 and other exports that need no suppression return corners, score and class. YOLOX returns
-offsets on the grid of its strides, unless exported with ``--decode_in_inference``. DETR's descendants return boxes as
-fractions of the image, together with logits or scores.
+YOLOv5 and v7 return rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 return the same, transposed
+and without objectness; YOLOv10 and other exports that need no suppression return corners, score and class. YOLOX
+returns offsets on the grid of its strides, unless exported with ``--decode_in_inference``. DETR's descendants return
+boxes as fractions of the image, together with logits or scores.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def describe(outputs: Outputs) -> str:
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
     """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
 
-    Raises FileFormatError if they fit no family or several. ``classes`` is the number of known class names.
+    Raises FileFormatError if the outputs fit no family or several. ``classes`` is the number of class names.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -258,7 +258,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's best class. NaN counts as the best score, so that its row is dropped later."""
+    """Choose each row's best class. NaN counts as the best score, so that its row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)

@@ -180,7 +180,7 @@ class MarkerDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, ordered by id.

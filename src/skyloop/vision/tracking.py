@@ -9,7 +9,7 @@ sizes (Danelljan, Häger, Khan and Felsberg, "Accurate scale estimation for robu
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
 2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half of the points that
-return closest to their start is kept, and of these the half whose surroundings look most alike. Their median
+return closest to their start is kept, and then the half of these whose surroundings changed least. Their median
 displacement gives the motion, and the median change of the distances between them gives the scale.
 
 **Learned.** ViTTrack (``cv2.TrackerVit``) is a single ONNX file. NanoTrack (``cv2.TrackerNano``) consists of two files:
@@ -53,7 +53,7 @@ class TrackResult:
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
     score: float  #: similarity to the target, 0 to 1; a score, not a probability
-    confidence: float | None = None  #: probability that the overlap is at least half; None without an estimate
+    confidence: float | None = None  #: probability that the overlap is at least half; None if there is no estimate
 
     @property
     def lost(self) -> bool:
@@ -171,7 +171,7 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box, at least partly in the image, to a size (width, height). Pixels outside repeat the edge."""
+    """Sample a box that is at least partly in the image, at a size (width, height). Pixels outside repeat the edge."""
     x, y, width, height = box
     rows, columns = image.shape[:2]
     left, top = max(0, math.floor(x) - 1), max(0, math.floor(y) - 1)
@@ -499,7 +499,7 @@ def _stretch(before: Floats, after: Floats) -> float:
 
 
 class LearnedTracker(Tracker):
-    """Tracks by a neural network that OpenCV runs on the CPU. The score is the one returned by the network.
+    """Tracks by a neural network that OpenCV runs on the CPU. The score comes from the network.
 
     Skyloop doesn't include the weights: the OpenCV Zoo offers object_tracking_vittrack_2023sep.onnx, and NanoTrack's
     repository has its two files.
@@ -549,7 +549,7 @@ class LearnedTracker(Tracker):
         return TrackResult(None if lost else (x, y, width, height), score)
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        """Call OpenCV's tracker. A file with a different network often loads and only fails here."""
+        """Call OpenCV's tracker. A file with a different network often loads without an error and fails only here."""
         try:
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:
