@@ -29,7 +29,8 @@ from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
 #: Drag on a small quadrotor at a few metres per second [1/s]. Identified values: 0.58 for an AR.Drone 2 (Engel, Sturm
-#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim``).
+#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1
+#: (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
 _HISTORY_S: Final = 3.0  # length of the motion history
 _SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates

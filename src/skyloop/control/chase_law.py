@@ -418,7 +418,8 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
         The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
-        position is uncertain, the vehicle stays further away and assumes that the object may stop.
+        position is uncertain, for example because it is out of view, the vehicle stays further away and assumes that
+        the object may stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m

@@ -345,7 +345,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the current set-point. While the position is unknown, the vehicle is level and not braked."""
+        """Compute the current set-point. While the position is unknown, the vehicle is level and does not brake."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None

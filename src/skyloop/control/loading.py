@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache confuses files with the same size and second."""
+    """Always compiles the source: Python's cache misses changes of the same size within the same second."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)

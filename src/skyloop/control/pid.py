@@ -142,7 +142,7 @@ class Pid:
     def applied(self, output: float) -> None:
         """Report the output that was actually applied, in case a limit outside this controller reduced it.
 
-        The integral term then follows the applied output (back-calculation).
+        The integral follows that output (back-calculation). :meth:`step` calls this with its own limited output.
 
         Args:
             output: The applied output.

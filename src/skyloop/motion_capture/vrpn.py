@@ -15,7 +15,7 @@ offset  type   meaning
 ======  =====  ====================================================================================
 
 A description (type -1 for a sender, -2 for a type) has the number in its sender field. Its payload is the name's length
-(u32, including the final NUL) and the name. Poses have the type with the description ``vrpn_Tracker Pos_Quat``. Its
+(u32, including the final NUL) and the name. Poses have the type with the description ``vrpn_Tracker Pos_Quat``. Their
 payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
 
 A client that never sends a UDP port receives everything over TCP.
@@ -194,7 +194,7 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Return whether all reporting trackers have had time to reveal whether they have several sensors."""
+        """Return whether all reporting trackers have had time to reveal further sensors."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property

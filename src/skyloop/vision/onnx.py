@@ -29,7 +29,7 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
     """Load a network after a child process has loaded and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
     Return the exceptions that a run can raise, and ONNX Runtime's session. ``purpose`` is a noun phrase for the error
-    message. FileFormatError if ONNX Runtime can't load the file within the limits.
+    message. Raises FileFormatError if ONNX Runtime can't load the file within the limits.
     """
     try:
         import onnxruntime

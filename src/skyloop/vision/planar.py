@@ -117,7 +117,7 @@ _FAMILIES: Final = (
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between attempts, which take 2 ms each at 320×240 and end once a marker is found
+_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), made until a marker is found
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
