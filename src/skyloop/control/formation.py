@@ -113,7 +113,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
 
 
 def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
-    """Turn a shape and move it into world axes.
+    """Rotate a shape and move it into world axes.
 
     Args:
         shape: The formation shape, (n, 3) [m].

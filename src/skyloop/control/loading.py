@@ -144,7 +144,7 @@ class Reloader:
 
     @property
     def waiting(self) -> bool:
-        """Whether :meth:`take` has something to return."""
+        """Whether :meth:`take` has anything to return."""
         return bool(self._loaded)
 
     @property

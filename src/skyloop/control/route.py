@@ -54,7 +54,7 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class Look(_Part, frozen=True, tag_field="do", tag="look"):
-    """Turn to a yaw, or towards a point (x, y)."""
+    """Turn to a given yaw, or towards a point (x, y)."""
 
     yaw: Angle | None = None
     at: Point | None = None
@@ -138,13 +138,13 @@ class Route(_Part, frozen=True, kw_only=True):
         return self.speed if own is None else own
 
     def to_json(self) -> bytes:
-        """Return the content of the route's file."""
+        """Return the contents of the route's file."""
         plain: dict[str, Any] = {"version": self.version, **msgspec.to_builtins(self)}
         return msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of a file; if it is not a route, UsageError says where and why."""
+    """Read a route from the contents of a file; if it is not a route, UsageError says where and why."""
     try:
         return checked(msgspec.json.decode(content, type=Route))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -203,7 +203,7 @@ class Conditions:
 class Finding(msgspec.Struct, frozen=True):
     """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: number from 1 (for a leg, of its end point), or None for the whole route
+    waypoint: int | None  #: number of the waypoint, or of the leg's end point, from 1; None for the whole route
     severity: Literal["error", "warning"]
     reason: str
 

@@ -264,7 +264,7 @@ def _name(action: Action) -> str:
 
 
 class FlyRoute(Controller):
-    """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the route's end.
+    """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the end of the route.
 
     The vehicle must be airborne when :meth:`run` is called. Each step is published as an event of kind
     ``vehicle_message`` with ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. If

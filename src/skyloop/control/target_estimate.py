@@ -309,7 +309,7 @@ class TargetEstimator:
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
         """Start from a first box at a guessed range, with the target size that explains the box.
 
-        ``share`` is the relative standard deviation of the range. Foot position and height scale with the range.
+        ``share`` is the relative standard deviation of the range. The foot's position and height scale with it.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top

@@ -136,7 +136,7 @@ class TargetFinder:
         """Use detections that arrive after their image was processed; return whether they show or may show the target.
 
         If the tracker missed the target in that image or found it elsewhere, it restarts from the detection. Detections
-        are ignored if their image is not among the last ones passed to :meth:`see`.
+        are ignored if their image is not among the most recent images passed to :meth:`see`.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:

@@ -57,7 +57,7 @@ MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callab
 class MotionCapture:
     """Poses of bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
 
-    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True`` they run on the
+    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True``, callbacks run on the
     receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. Exceptions in
     callbacks are counted and logged and do not affect other callbacks.
 
@@ -340,7 +340,7 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # poses have this age on arrival
+                    track.look(monotonic_ns() - self.latency_ns)  # age of the poses on arrival
                 self._report(track)
 
     def _report(self, track: Track) -> None:
@@ -369,7 +369,7 @@ class MotionCapture:
 
 
 def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
-    """Do nothing, because motion capture has no events for program errors and the listener logs them."""
+    """Do nothing: motion capture has no events for program errors, and the listener logs them."""
 
 
 class Linked:

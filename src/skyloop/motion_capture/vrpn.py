@@ -251,7 +251,7 @@ class VrpnSource:
         """Close the connection. Idempotent."""
         self._ended.set()
         if self._reader.ident is not None and self._reader is not threading.current_thread():
-            self._reader.join(CONNECT_S + 1.0)  # name lookups may take longer, but they do end
+            self._reader.join(CONNECT_S + 1.0)  # name lookups may take longer, but always end
 
     # --- reader thread ---
 

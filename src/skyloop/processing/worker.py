@@ -154,7 +154,7 @@ def _source(kind: type[Any]) -> bytes:
 
 _LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
-_KEPT: Final = 1024  #: number of most recent results and frames kept to compute rates and ages
+_KEPT: Final = 1024  #: number of recent results and frames kept for computing rates and ages
 #: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
@@ -379,7 +379,7 @@ class Frames:
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
-        """Decode the frame; None if that fails (its channel counts failures)."""
+        """Decode the frame; return None if decoding fails (the frame's channel counts failures)."""
         return (self._channel or self._usual).picture(arrival)
 
     # On the receiving thread, except while entering --------------------------------------------------------------
@@ -422,7 +422,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     results: int = 0
     dropped: int = 0  #: number of frames replaced by newer ones before the worker was ready
     stale: int = 0  #: number of frames that were too old when their turn came
-    errors: int = 0  #: number of ``process`` calls that raised
+    errors: int = 0  #: number of ``process`` calls that raised an exception
     refused: int = 0  #: number of results that can't be sent
     unsent: int = 0  #: number of results that the transport did not accept
     frames_hz: float = 0.0

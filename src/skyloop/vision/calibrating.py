@@ -149,7 +149,7 @@ class Board:
 
 
 class BoardFinder:
-    """Detects one board in images. Keeps OpenCV's working memory, so use one finder per thread.
+    """Detects one board in images. A finder keeps OpenCV's working memory, so use one per thread.
 
     Attributes:
         board: The board to detect.

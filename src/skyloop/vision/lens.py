@@ -28,7 +28,7 @@ _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversi
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
+    """Check an image; return its pixels as a plain array and its intrinsics, which default to the frame's own.
 
     It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. Raise UsageError
     if the shape or type is wrong, the array is empty, or the intrinsics are missing.

@@ -129,7 +129,7 @@ class MarkerSighting(PlanarSighting):
 
 
 class MarkerDetector:
-    """Detects markers of one dictionary and one size. Keeps OpenCV's working memory, so use one detector per thread.
+    """Detects markers of one dictionary and one size. A detector keeps OpenCV's working memory, so use one per thread.
 
     Attributes:
         dictionary: The dictionary's name, as given.
