@@ -28,8 +28,9 @@ from skyloop.messages import Feedback, FlightState, Vector, Velocity
 from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
-#: Drag on a small quadrotor at a few metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (Engel, Sturm and
-#: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
+#: Drag on a small quadrotor at a few metres per second [1/s]. Identified values: 0.58 for an AR.Drone 2 (Engel, Sturm
+#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1
+#: (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
 _HISTORY_S: Final = 3.0  # length of the motion history
 _SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates
@@ -39,7 +40,7 @@ _STEEPEST: Final = 0.5  # minimum cosine of the tilt; a vehicle that tilts more 
 
 
 def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
-    """Return a sighting's time; None if it lies in the future, because the sighting would seem fresh until then."""
+    """Return a sighting's time; None if it lies in the future, because such a sighting would seem fresh until then."""
     return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
 
 
@@ -74,11 +75,11 @@ class Motion:
         return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
-        """Add a fraction of the current velocity error to a wanted velocity.
+        """Add a fraction of the current velocity error to a desired velocity.
 
         Args:
-            wanted: The wanted velocity in odometry axes, (3,) [m/s].
-            share: Fraction of the difference between the wanted and the current velocity to add; 0 or more.
+            wanted: The desired velocity in odometry axes, (3,) [m/s].
+            share: Fraction of the difference between the desired and the current velocity to add; 0 or more.
         """
         return wanted + share * (wanted - self.velocity)
 
@@ -90,7 +91,7 @@ class Airframe:
         feedback: The newest sample, with non-finite values removed; None before the first sample.
         by_tilt: Whether the vehicle reports no velocity, so that :class:`TiltVelocity` estimates it from the attitude.
         interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
-            axes stored before such a gap are off by the distance flown during the gap.
+            axes stored before such a gap are wrong by the distance flown during the gap.
     """
 
     def __init__(self, *needs: Part) -> None:
@@ -113,7 +114,7 @@ class Airframe:
 
         Args:
             feedback: The new sample; non-finite values count as missing. If it is several seconds older than the last
-                one, the history restarts, because the last one's time was wrong or the proxy's clock was set back.
+                one, the history restarts, because the last sample's time was wrong or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
@@ -145,7 +146,7 @@ class Airframe:
         return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
-        """Return a sentence naming the required parts of the state that are unknown now; empty if all are known."""
+        """Return a sentence naming the required parts of the state that are unknown; empty if all are known."""
         old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
@@ -170,7 +171,7 @@ class Airframe:
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """Return the motion at a time [ns], extrapolated from the nearest sample; None if it is unknown."""
+        """Return the motion at a given time [ns], extrapolated from the nearest sample; None if it is unknown."""
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -253,8 +254,7 @@ class TiltVelocity:
             feedback: The vehicle's newest state; a landed vehicle is taken to be at rest.
 
         Returns:
-            The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None if the attitude is
-            unknown.
+            The velocity forward, left, up (0) in the levelled body's axes [m/s]; None if the attitude is unknown.
         """
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
         if roll is None or pitch is None or yaw is None:
@@ -306,7 +306,7 @@ class AirframeLaw:
         """Forget everything stored in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Return whether all required parts of the state are known; pause if not, or if the last step was long ago."""
+        """Return whether all required parts of the state are known; pause if not, or after a long gap between steps."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
         if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
@@ -319,7 +319,7 @@ class AirframeLaw:
         return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the motion at a time; the caller must have checked that it is known."""
+        """Return the motion at a given time; the caller must have checked that the motion is known."""
         motion = self.airframe.at(at_ns)
         assert motion is not None, "a law without its motion is not ready"
         return motion
@@ -378,7 +378,7 @@ def _finite(feedback: Feedback) -> Feedback:
 
 
 class TurningSearch:
-    """A search with a forward-facing camera: turns on the spot and changes the height after each full turn."""
+    """Searches with a forward-facing camera: turns on the spot and changes height after each full turn."""
 
     def __init__(
         self,
@@ -418,7 +418,7 @@ class TurningSearch:
 
         Args:
             yaw: Yaw of the vehicle [rad].
-            altitude: Height above the ground [m]; None keeps the current height.
+            altitude: Height above the ground [m]; None to keep the current height.
 
         Returns:
             Forward, left, up [m/s] and yaw rate [rad/s], (4,).

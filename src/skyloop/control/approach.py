@@ -65,7 +65,7 @@ class ApproachMarker(FollowMarker):
             size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: Settings for the control law; None for the defaults with ``aside_rad`` 0.
+            settings: Settings for the control law; if None, the defaults with ``aside_rad`` set to 0.
 
         Raises:
             UsageError: A number is not finite and greater than 0.
@@ -165,7 +165,7 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Circles a position, facing it or facing away from it, and then hovers; :meth:`run` returns.
+    """Circles a position while facing towards or away from it. At the end, the vehicle hovers and :meth:`run` returns.
 
     Requires the vehicle's position, like :class:`FollowPath`.
     """
@@ -207,11 +207,12 @@ class OrbitPlace(FollowPath):
 class LandOnMarker(Behaviour):
     """Searches for a marker in a spiral, descends above it, following its motion, and stops the motors after landing.
 
-    If the marker is lost during the approach, the vehicle climbs at its predicted position, then searches for it. When
-    the vehicle is so low that the marker no longer fits into the image, it descends by the marker's predicted motion;
-    if it would miss, it aborts and tries again. After too many aborts or too long a time, it climbs to a safe height
-    and hovers, and :meth:`run` returns with :attr:`landed` false, as it does if another client lands the vehicle. The
-    vehicle must be airborne when :meth:`run` is called; if :meth:`run` ends early, the vehicle hovers in place.
+    If the marker is lost during the approach, the vehicle climbs at its predicted position, then searches for the
+    marker. When the vehicle is so low that the marker no longer fits into the image, it descends using the marker's
+    predicted motion; if it would miss, it aborts and tries again. After too many aborts or too long a time, it climbs
+    to a safe height and hovers, and :meth:`run` returns with :attr:`landed` false. :attr:`landed` is also false if
+    another client lands it. The vehicle must be airborne when :meth:`run` is called; it hovers if :meth:`run` ends
+    early.
 
     Attributes:
         marker_id: ID of the marker.
@@ -278,7 +279,7 @@ class LandOnMarker(Behaviour):
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:
-            self.fly(self.drone.now_ns)  # on every sample, not only on frames, to react to gusts sooner
+            self.fly(self.drone.now_ns)  # called on every sample, not only on frames, to react to gusts sooner
 
     def on_frame(self, frame: Frame) -> None:
         """Search the frame, and end the behaviour if the control law has given up."""

@@ -38,11 +38,11 @@ class Behaviour(Controller):
     when :meth:`run` is called. If no frames arrive for more than :data:`BLIND_S`, or a part of the vehicle's state that
     the law needs is unknown, the vehicle hovers and an event gives the reason.
 
-    Subclasses define :meth:`look`, :attr:`phase` and, for phases without sight of the target, :attr:`losses`.
+    Subclasses define :meth:`look`, :attr:`phase` and, for phases in which the target is out of sight, :attr:`losses`.
     """
 
     name = "behaviour"  #: source of the annotations and prefix of event texts
-    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target, reported as warnings
+    losses: frozenset[StrEnum] = frozenset()  #: phases in which the target is out of sight; reported as warnings
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.
@@ -83,7 +83,7 @@ class Behaviour(Controller):
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        # abs() is needed because a frame with a time in the future would otherwise hide that frames have stopped.
+        # abs() is needed: a frame with a time in the future would otherwise hide the fact that frames have stopped.
         if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
@@ -168,7 +168,7 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Return a camera of the vehicle by name, or its first; raise UnknownNameError if there is none."""
+    """Return a camera of the vehicle by name, or its first camera; raise UnknownNameError if there is none."""
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

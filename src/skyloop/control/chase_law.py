@@ -40,7 +40,7 @@ from skyloop.messages.geometry import wrap_angle
 class FollowMode(StrEnum):
     """How to follow a target."""
 
-    FOLLOW = "follow"  #: keep a distance and, if given, a side
+    FOLLOW = "follow"  #: keep a distance from the target and, if specified, stay on one side of it
     ORBIT = "orbit"  #: circle the target, even while it moves
     LOOK = "look"  #: stay in place and turn towards the target
 
@@ -74,7 +74,7 @@ class ChaseSettings:
     nearest_m: float = 2.0  #: minimum distance to the target; the vehicle backs off from a target that comes closer
     clear_m: float = 1.5  #: minimum distance to other detected objects
     #: Side of the target to stay on, as a counter-clockwise angle from its direction of motion: 0 is in front of the
-    #: target, π behind it and π/2 on its left. With None, the vehicle stays on the side that it is on.
+    #: target, π behind it and π/2 on its left. If None, the vehicle stays on its current side.
     bearing_rad: float | None = None
     orbit_m_s: float = 0.8  #: speed around the target; positive is counter-clockwise as seen from above
     #: Maximum horizontal distance from the start, not exceeded even to evade a target; None means no leash. It is
@@ -83,8 +83,8 @@ class ChaseSettings:
     height_m: float | None = None  #: height above the ground; None for the height at the start
     lowest_m: float = 0.8  #: minimum height above the ground
     highest_m: float = 4.0  #: maximum height above the ground
-    #: Distance to rise (or sink, if rising is impossible) and return in order to measure the range of a target that may
-    #: not be on the ground. With None, the vehicle waits for the range without moving.
+    #: Distance by which to rise (or sink, if rising is impossible) and return, to measure the range of a target that
+    #: may not be on the ground. If None, the vehicle waits without moving until the range is known.
     parallax_m: float | None = 0.4
     #: maximum elevation of the target's centre, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
@@ -94,7 +94,7 @@ class ChaseSettings:
     velocity_gain: float = 3.0  #: acceleration per unit of velocity error [1/s]
     yaw_gain: float = 2.2  #: [1/s]
     height_gain: float = 1.0  #: [1/s]
-    round_gain: float = 1.2  #: gain of moving around to ``bearing_rad`` [1/s]
+    round_gain: float = 1.2  #: gain for moving around to ``bearing_rad`` [1/s]
     #: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
     speed_m_s: float = 4.0
     climb_m_s: float = 0.6  #: maximum vertical speed
@@ -107,7 +107,7 @@ class ChaseSettings:
     tilt_rad: float = 0.33  #: maximum tilt of a vehicle flown by attitude
     tilt_gain: float = 3.0  #: acceleration per unit of velocity error of a vehicle flown by attitude [1/s]
     lean_rad: float = 0.5  #: maximum lean that the model assumes for a vehicle flown by velocity
-    seen_s: float = 0.4  #: time after the last sighting for which the target still counts as seen
+    seen_s: float = 0.4  #: time for which the target still counts as seen after the last sighting
     predict_s: float = 2.0  #: time to follow a hidden target's predicted motion while slowing down
     hover_s: float = 4.0  #: time to hover afterwards, looking to both sides of the target's predicted position
     give_up_s: float = 25.0  #: time from the last sighting until giving up
@@ -132,7 +132,7 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
     def within(self, limits: Mapping[str, Value]) -> ChaseSettings:
-        """Return these settings clamped to a drone's limits, so that the law never expects more than is allowed.
+        """Return these settings clamped to a drone's limits, so that the law plans for no more than is allowed.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
@@ -159,7 +159,7 @@ _CONFIDENT_SIGMA_M = 0.35  # maximum standard deviation for a position to count 
 _UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
 _KEEP_SIDE_S = 1.0  # time for which evasion stays on the same side
 _HEAD_ON_SHARE = 0.2  # fraction of the clearance below which a pass is head-on, so that both sides are equally good
-_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep to the side opposite to the target's motion
+_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep that goes to the side opposite the target's motion
 _HEIGHT_REACHED_M = 0.1  # distance from a parallax height at which the vehicle heads for the other one
 _ALONG_M_S = 0.4  # minimum speed for a target's direction of motion to be usable
 
@@ -183,7 +183,7 @@ class ChaseLaw:
         self.settings = settings or ChaseSettings()  #: settings, which can be replaced in flight
         self.mode = mode  #: pursuit mode, which can be changed in flight
         self.phase = TargetPhase.LOOKING  #: phase at the last step
-        #: estimated minus wanted distance at the last step; None if the distance was not controlled
+        #: estimated minus desired distance at the last step; None if the distance was not controlled
         self.off_m: float | None = None
         self.held_by = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
         self._heading: float | None = None  # last known direction of the target's motion
@@ -208,7 +208,7 @@ class ChaseLaw:
         self,
         now_ns: int,  # the current time on the proxy's clock
         motion: Motion,  # the vehicle's newest motion, from dead reckoning if ``relative``
-        altitude_m: float | None,  # height above the ground; None leaves the height unchanged
+        altitude_m: float | None,  # height above the ground; None to leave the height unchanged
         target: TargetEstimator | None,  # the target's filter; None before the first sighting
         seen_ns: int | None,  # time of the target's last certain or possible sighting; None if there was none
         others: Sequence[TargetState] = (),  # recently seen objects to keep clear of
@@ -272,7 +272,7 @@ class ChaseLaw:
         self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
-        """Return the vehicle's motion at the time when a set-point sent now takes effect, given those already sent."""
+        """Return the vehicle's motion at the time when a set-point sent now takes effect, given earlier set-points."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
         if predicted is None:
@@ -342,7 +342,7 @@ class ChaseLaw:
         return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
 
     def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
-        """Return the yaw rate that turns the vehicle towards the target, or ``aside`` [rad] to the left of it."""
+        """Return the yaw rate for turning to face the target, or a direction ``aside`` [rad] to its left."""
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
@@ -354,7 +354,7 @@ class ChaseLaw:
         return turn
 
     def _horizontal(self, own: Motion, state: TargetState) -> Array:
-        """Return the wanted velocity, (2,) in odometry axes [m/s]."""
+        """Return the desired velocity, (2,) in odometry axes [m/s]."""
         s = self.settings
         offset = state.foot[:2] - own.position[:2]
         across = max(0.3, float(np.hypot(*offset)))
@@ -362,14 +362,14 @@ class ChaseLaw:
         aside = np.array([-sight[1], sight[0]])
         near = max(0.3, across - state.margin_m)
         self.off_m = near - s.distance_m
-        # Approach only as fast as the vehicle can stop; back off at the speed given by the gain.
+        # Approach only at a speed from which the vehicle can stop; back off at the speed given by the gain.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
         moving = self._soon(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
             wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above, with the target on the left
         elif s.bearing_rad is None:
-            # With no side chosen, only the yaw follows the target's motion across the line of sight.
+            # If no side is chosen, only the yaw follows the target's motion across the line of sight.
             wanted = wanted - aside * float(moving @ aside)
         else:
             wanted = wanted + aside * self._round(state, sight, across)
@@ -377,7 +377,7 @@ class ChaseLaw:
         return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
-        """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle has matched it."""
+        """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle will have matched it."""
         s, velocity = self.settings, state.velocity
         if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
             dt_s = seconds(at_ns - self._previous_velocity[0])
@@ -390,7 +390,7 @@ class ChaseLaw:
         return velocity + s.response_s * change
 
     def _round(self, state: TargetState, sight: Array, across: float) -> float:
-        """Return the speed to the left of the line of sight that moves the vehicle to its side of the target."""
+        """Return the speed to the left, across the line of sight, for moving to the chosen side of the target."""
         s = self.settings
         if float(np.hypot(*state.velocity)) > _ALONG_M_S:
             self._heading = math.atan2(state.velocity[1], state.velocity[0])
@@ -418,7 +418,8 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], for keeping clear of another object.
 
         The closest approach is computed for both the vehicle's current and its next velocity. If the other object's
-        position is uncertain, for example out of view, the vehicle stays further away and is prepared for it to stop.
+        position is uncertain, for example because it is out of view, the vehicle stays further away and assumes that
+        the object may stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
@@ -486,7 +487,7 @@ class ChaseLaw:
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _for_parallax(self, height: float, altitude_m: float) -> float:
-        """Return the next of two heights that reveal the range; rising is preferred because people may be below."""
+        """Return the next of two heights for measuring the range; climb first, because people may be below."""
         s = self.settings
         other = height = within(height, s.lowest_m, s.highest_m)
         if s.parallax_m is not None:
@@ -521,7 +522,7 @@ class ChaseLaw:
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
-    """Return distance [m] and time [s] of the closest approach, and the unit vector towards the side to pass on.
+    """Return the distance [m] and time [s] of the closest approach, and the unit vector towards the passing side.
 
     ``here`` is the vehicle's position relative to the other object, and ``moving`` its relative velocity.
     """

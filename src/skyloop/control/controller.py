@@ -118,7 +118,7 @@ class Controller:
         controller's state here, for example ``self.target = before.target``.
 
         Args:
-            before: The controller that was running until now.
+            before: The controller that ran until now.
         """
 
     # Methods to call ----------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """A control law that flies a course by a map and corrects the map with camera sightings. Pure.
 
-The map contains the positions of gates and poles. The vehicle's own position is only known by odometry from its start.
-Each gate seen corrects the offset between map and odometry, and each pole seen is moved to its observed position. The
-route to the next gate leads around poles and other gates to a point in front of the opening, then along its axis.
+The map contains the positions of gates and poles. Only odometry gives the vehicle's own position since the start. Each
+gate seen corrects the offset between map and odometry, and each pole seen is moved to its observed position. The route
+to the next gate leads around poles and other gates to a point in front of the opening, then along its axis.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from skyloop.messages.geometry import turned, wrap_angle
 
 _SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
 _TILT_RAD = 0.012  # standard deviation of elevations, due to errors of the attitude and of pole tops in the image
-_REPEATED = 3.0  # factor for the noise, because errors repeat from one sighting to the next
+_REPEATED = 3.0  # factor by which to increase the noise, because errors persist from one sighting to the next
 _SIDES = 3  # number of viewing directions: along a gate's axis and from either side
 
 
@@ -73,7 +73,7 @@ class CourseSettings:
     map_m: float = 0.05  #: standard deviation of map positions, horizontal and vertical
     start_m: float = 0.2  #: standard deviation of the start position
     sightings: int = 3  #: number of sightings of a gate required before flying through it
-    waiting_s: float = 2.5  #: waiting time at each viewpoint; after the last one, the law is stuck
+    waiting_s: float = 2.5  #: waiting time at each viewpoint; after the last viewpoint, ``stuck`` is set
     braking_per_s: float = 1.3  #: maximum speed towards an obstacle per metre of distance beyond half the clearance
     plan_s: float = 0.4  #: interval between route plans
 
@@ -132,7 +132,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Trust the map no more than initially, and look at the gate again."""
+        """Reset the confidence in the map to its initial level, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self.number)

@@ -31,7 +31,7 @@ class LowPass(Generic[Signal]):
 
         Args:
             time_constant_s: Time constant, 0 or more.
-            value: Initial value; None starts from the first sample.
+            value: Initial value; None to start from the first sample.
 
         Raises:
             UsageError: The time constant is negative or not finite.
@@ -67,7 +67,7 @@ class LowPass(Generic[Signal]):
         return self.value
 
     def reset(self, value: Signal | None = None) -> None:
-        """Restart from a value; None starts from the next sample."""
+        """Restart from a value; None to start from the next sample."""
         self.value = value
 
 
@@ -84,7 +84,7 @@ class Complementary:
 
         Args:
             time_constant_s: Time constant: below it the rate dominates, above it the measured angle.
-            angle: Initial angle; None starts from the first measurement.
+            angle: Initial angle; None to start from the first measurement.
 
         Raises:
             UsageError: The time constant is negative or not finite.

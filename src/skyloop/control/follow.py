@@ -72,7 +72,7 @@ class FollowLaw(VelocityLaw):
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
         self.mode = Mode.SEARCHING  #: phase at the last step
-        #: Wanted angle around the marker, counter-clockwise from its normal as seen from above [rad].
+        #: Desired angle around the marker, counter-clockwise from its normal as seen from above [rad].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0  #: rate of change of ``station_rad``
         self.off_m: float | None = None  #: combined error of distance and height at the last step; None while searching
@@ -117,7 +117,7 @@ class FollowLaw(VelocityLaw):
         return wanted
 
     def _follow(self, own: Motion, unseen_s: float) -> Array:
-        """Return the wanted forward, left and up velocity [m/s] and yaw rate [rad/s] while the target is known."""
+        """Return the desired forward, left and up velocity [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
         # After losing the marker, the vehicle stops moving within a second but keeps turning.
         fade = within(1.0 - (unseen_s - s.following_s), 0.0, 1.0)
@@ -145,7 +145,7 @@ class FollowLaw(VelocityLaw):
         if self._face is None or float(np.hypot(*self._face)) < 0.3:  # facing up or down, or estimates cancel out
             self.aside_rad = None
             return 0.0
-        # Compute the counter-clockwise angle from the direction to the vehicle to the marker's normal.
+        # Compute the angle from the vehicle's direction to the marker's normal, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)
@@ -215,12 +215,12 @@ class FollowScore:
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Return the estimated minus the wanted distance for each sighting from ``after_s`` after the first one."""
+        """Return the estimated minus the desired distance for each sighting, starting ``after_s`` after the first."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
     def count(self, captured_ns: int, range_error_m: float | None) -> None:
-        """Count a frame; ``range_error_m`` is the estimated minus the wanted distance, or None without a sighting."""
+        """Count a frame; ``range_error_m`` is the estimated minus the desired distance, or None without a sighting."""
         if range_error_m is not None:
             if self.first_seen_ns is None:
                 self.first_seen_ns = captured_ns
@@ -287,7 +287,7 @@ class FollowMarker(Behaviour):
 
     @property
     def distance_m(self) -> float:
-        """Wanted distance from the marker [m]."""
+        """Desired distance from the marker [m]."""
         return self._follow_law.settings.distance_m
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -298,7 +298,7 @@ class FollowMarker(Behaviour):
         return self._drawing(frame, seen, mine)
 
     def _use(self, sighting: MarkerSighting, frame: Frame) -> float:
-        """Update the control law and return the estimated minus the wanted distance [m]."""
+        """Update the control law and return the estimated minus the desired distance [m]."""
         place = sighting.position_in_body(self._mounting)
         if frame.feedback is not None:
             normal = sighting.normal_in_body(self._mounting)

@@ -46,7 +46,7 @@ def line(n: int, spacing_m: float) -> Places:
 
 
 def column(n: int, spacing_m: float) -> Places:
-    """Return a column of drones behind one another, the first at the front.
+    """Return a column of drones behind one another, with the first drone at the front.
 
     Args:
         n: Number of drones.
@@ -100,7 +100,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours in a row and between rows.
-        columns: Number of drones per row; None makes the grid as square as possible.
+        columns: Number of drones per row; None to make the grid as square as possible.
 
     Raises:
         UsageError: An argument is out of range.
@@ -113,7 +113,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
 
 
 def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
-    """Turn a shape and move it into world axes.
+    """Rotate a shape and move it into world axes.
 
     Args:
         shape: The formation shape, (n, 3) [m].
@@ -171,7 +171,7 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
 
 
 def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
-    """Return the closest approach between drones that fly straight from start to goal, all in the same time.
+    """Return the closest approach between drones that fly straight from start to goal and all take the same time.
 
     Args:
         starts: Start positions, (n, 3) [m].
@@ -199,8 +199,8 @@ def kept_apart(
     """Change velocities so that drones closer together than ``apart_m`` separate.
 
     Their distance grows at a rate of ``gain`` times the missing distance, and each drone contributes half of that. If
-    one of them doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the
-    distance beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
+    one drone doesn't yield, the other makes the whole change and approaches at no more than ``gain`` times the distance
+    beyond ``apart_m``. Velocity components perpendicular to the line between the drones are unchanged.
 
     Args:
         velocities: Velocities in world axes, (n, 3) [m/s].

@@ -95,15 +95,14 @@ class Formation:
         Args:
             slots: Positions in world axes, (n, 3) [m]; at least one for each drone.
             speed_m_s: Maximum speed of the drone that has the longest path.
-            yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Time until drones not at their slots have failed; None allows ten seconds more than planned.
+            yaw: Yaw of all drones [rad]; None to leave it free.
+            timeout_s: Time after which drones not yet at their slots have failed; None for 10 s more than planned.
 
         Returns:
             A report with the drones' final positions and how close they came to each other.
 
         Raises:
-            UsageError: A drone can't be flown by position, two would come closer than ``apart_m``, or no drone is
-                active.
+            UsageError: A drone can't be flown by position, two would be closer than ``apart_m``, or none is active.
             SwarmError: A drone failed, and the swarm's ``on_error`` is not ``"continue"``.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
@@ -196,7 +195,7 @@ class Formation:
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
         """Return the newest states of the drones steered here and the last known states of all other airborne drones.
 
-        A drone steered here fails if its position is no longer known, and then counts as one of the others.
+        A drone steered here fails when its position becomes unknown, and is then treated like the other drones.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -281,7 +280,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """The settings with larger acceptance radii, for drones that hover just after arrival."""
+        """The settings with larger acceptance radii, for drones that start to hover just after arriving."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -315,7 +314,7 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
 
 def _carried_on(airframe: Airframe) -> Feedback:
-    """Return a drone's newest feedback, with a missing position extrapolated and a missing yaw taken from the past."""
+    """Return a drone's newest feedback; extrapolate the position if it is missing, and use the last known yaw."""
     sample = airframe.feedback
     assert sample is not None, "called only after the first feedback"
     now_ns = sample.captured_ns

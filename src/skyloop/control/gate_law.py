@@ -1,4 +1,4 @@
-"""A control law for flying through a gate, and a planner for the shortest way around posts and gates. Pure.
+"""A control law for flying through a gate, and a planner for the shortest path around posts and gates. Pure.
 
 The law uses position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4),
 2006) to compute velocities from sightings and feedback. The gate's position and axis are stored in odometry axes, where
@@ -6,7 +6,7 @@ only odometry drift affects them. Facing the opening, the vehicle moves onto the
 alignment improves, and flies through. The last metre and a half is flown by odometry, because at that range the gate no
 longer fits into the image.
 
-The way around obstacles is found by Dijkstra's algorithm in a two-dimensional visibility graph over points around each
+The path around obstacles is found by Dijkstra's algorithm in a two-dimensional visibility graph over points around each
 obstacle (Lozano-Pérez and Wesley, "An algorithm for planning collision-free paths among polyhedral obstacles",
 Communications of the ACM 22(10), 1979).
 """
@@ -33,7 +33,7 @@ Point = tuple[float, float]
 
 _AROUND = 8  # number of graph points around each end of a wall
 _OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor that keeps lines between these points clear
-_WITHIN_M = 0.02  # margin by which the way may come closer to a wall than its start or goal
+_WITHIN_M = 0.02  # margin by which the path may be closer to a wall than its start or goal is
 
 
 class GatePhase(StrEnum):
@@ -206,10 +206,10 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, including the goal but not the start; None if there is no way.
+    """Return the points of the shortest path, including the goal but not the start; None if there is no path.
 
-    Start and goal may be too close to a wall, but the way comes no closer to it. Points are east, north [m]. Pass at
-    most a few dozen walls, because the effort grows with the cube of their number.
+    The start and goal may be too close to a wall, but the path gets no closer to that wall than they are. Points are
+    east, north [m]. Pass at most a few dozen walls, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)
@@ -237,7 +237,7 @@ def _corners(ends: Array, reach: Array) -> list[Array]:
 
 
 def _shortest(points: Array, lengths: Array) -> list[Point] | None:
-    """Return the shortest way from the first point to the second one."""
+    """Return the shortest path from the first point to the second."""
     best, came = {0: 0.0}, {0: 0}
     queue = [(0.0, 0)]
     while queue:
@@ -258,7 +258,7 @@ def _shortest(points: Array, lengths: Array) -> list[Point] | None:
 
 
 def _distances(begin: Array, end: Array, walls: Array) -> Array:
-    """Return the distances (n, m) between n segments, given by ends (n, 2), and m walls (m, 2, 2)."""
+    """Return the distances (n, m) between n segments, given by their ends (n, 2), and m walls (m, 2, 2)."""
     a, b = begin[:, None], end[:, None]
     c, d = walls[None, :, 0], walls[None, :, 1]
     apart = np.minimum(

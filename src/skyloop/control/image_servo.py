@@ -61,8 +61,8 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 def camera_twist(camera: CameraInfo) -> Array:
     """Return the matrix (6, 4) that converts motion of the levelled vehicle to the twist of a level camera.
 
-    The columns stand for forward, left, up [m/s] and yaw rate [rad/s]. The camera's mounting position matters, because
-    a camera ahead of the centre swings sideways when the vehicle turns.
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's mounting position matters, because a
+    camera ahead of the centre swings sideways when the vehicle turns.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -85,7 +85,7 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that makes a level camera's points (n, 2) converge exponentially to their wanted positions.
+    """Compute the motion that makes a level camera's points (n, 2) converge exponentially to their goals.
 
     The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`): forward, left, up [m/s] and yaw
     rate [rad/s], (4,). The gain is in 1/s.
@@ -116,13 +116,13 @@ class ServoSettings:
     """Gain and limits of :class:`ImageServoLaw`."""
 
     gain: float = 0.8  #: [1/s]
-    #: Fraction of the velocity error that is added to the set-point against gusts if the velocity is known.
+    #: Fraction of the velocity error that is added to the set-point to counteract gusts, if the velocity is known.
     velocity_gain: float = 1.0
     speed_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.0
     acceleration_m_s2: float = 2.0
-    fresh_s: float = 0.3  #: time to carry on without a sighting
+    fresh_s: float = 0.3  #: time to continue without a sighting
     holding_s: float = 2.0
     search_rad_s: float = 0.7
 
@@ -144,7 +144,7 @@ class ImageServoLaw(VelocityLaw):
         )
         super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING  #: phase at the last step
-        self.error = math.inf  #: RMS distance between the points and their wanted positions in the plane at z = 1
+        self.error = math.inf  #: RMS distance between the points and their desired positions in the plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
         self._depth_m = depth_m
@@ -195,7 +195,7 @@ class ImageServoLaw(VelocityLaw):
 class ImageServo(Behaviour):
     """Flies to where a marker appears as seen from ``distance_m`` straight in front of it, and holds that position.
 
-    Control works purely in the image: the marker's size is only used to compute the wanted image. Runs until stopped.
+    Control works purely in the image: the marker's size only serves to compute the desired image. Runs until stopped.
     """
 
     name = "servo"
@@ -217,7 +217,7 @@ class ImageServo(Behaviour):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             marker_id: ID of the marker.
-            distance_m: Wanted distance straight in front of the marker.
+            distance_m: Desired distance straight in front of the marker.
             size_m: Edge length of the marker's black square.
             dictionary: The marker's dictionary.
             camera: A forward-facing camera; None for the vehicle's first camera.
@@ -246,7 +246,7 @@ class ImageServo(Behaviour):
 
     @property
     def error_px(self) -> float:
-        """RMS distance between the corners and their wanted positions [px]; infinite before the first sighting."""
+        """RMS distance between the corners and their desired positions [px]; infinite before the first sighting."""
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -291,7 +291,7 @@ class FlowSettings:
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
     lead_s: float = 0.12  #: delay between computing a set-point and its effect
-    fresh_s: float = 0.3  #: time to carry on without sight of the ground
+    fresh_s: float = 0.3  #: time to continue while the ground is out of sight
 
     def __post_init__(self) -> None:
         require_positive(self.__dataclass_fields__, **asdict(self))
@@ -310,7 +310,7 @@ class FlowLaw(AirframeLaw):
     """Computes attitudes from horizontal positions. Pure; times are on the proxy's clock [ns].
 
     A PID controller for each axis computes the acceleration from the position, its integral and the velocity. The
-    velocity comes from a constant-velocity filter over the positions, not from the vehicle.
+    velocity comes from a constant-velocity filter applied to the positions, not from the vehicle.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
@@ -345,7 +345,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the current set-point. While the position is unknown, the attitude is level, which doesn't brake."""
+        """Compute the current set-point. While the position is unknown, the vehicle is level and does not brake."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -375,9 +375,9 @@ class FlowLaw(AirframeLaw):
 class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, using a downward-facing camera.
 
-    It requires only attitude and height from the vehicle's feedback and flies by attitude set-points. Without sight of
-    the ground, the vehicle hovers and may drift, and a warning event is published. Once the ground is in view again,
-    the behaviour holds its new position.
+    It requires only attitude and height from the vehicle's feedback and flies by attitude set-points. If the camera
+    can't see the ground, the vehicle hovers and may drift, and a warning event is published. Once the ground is in view
+    again, the behaviour holds its new position.
     """
 
     name = "flow hover"
@@ -413,7 +413,7 @@ class FlowHover(Behaviour):
         return self._flow_law.off_m
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point, or hover while the ground is out of view, which the event for the phase reports."""
+        """Send the set-point, or hover while the ground is out of view; the event for the phase reports this."""
         if self.phase is FlowPhase.HOLDING:
             super().steer(wanted)
         else:

@@ -56,7 +56,7 @@ class TurnEstimate:
     position: Array  #: position, (3,) [m]
     velocity: Array  #: velocity, (3,) [m/s]
     turn_rate: float  #: turn rate of the horizontal velocity, counter-clockwise as seen from above [rad/s]
-    extra: Array  #: horizontal acceleration in addition to that of the turn, (2,) [m/s²]
+    extra: Array  #: horizontal acceleration in addition to the turn's, (2,) [m/s²]
     covariance: Array  #: covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7)
 
     @property
@@ -125,7 +125,7 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether the position was used. False means outside the gate (counted in :attr:`refused`) or too old.
+            Whether the position was used: it must be inside the gate (see :attr:`refused`) and not too old.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
@@ -143,7 +143,7 @@ class _Filter(ABC, Generic[_E]):
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict the estimate for a time; for times before the last measurement, return the last estimate.
+        """Predict the estimate for a given time; for times before the last measurement, return the last estimate.
 
         Args:
             at_ns: Time of the prediction.
@@ -200,8 +200,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
             dimensions: Number of dimensions of the position; 1 or more.
             intensity_m2_s3: Intensity of the acceleration's white noise; its root is the velocity change in 1 s.
             speed_m_s: Initial standard deviation of each velocity component.
-            gate: Mahalanobis distance, in standard deviations, above which measurements are refused; ``math.inf``
-                accepts all.
+            gate: Maximum Mahalanobis distance of a measurement, in standard deviations; ``math.inf`` accepts all.
 
         Raises:
             UsageError: An argument is out of range.
@@ -239,7 +238,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates a point's motion in levelled axes from positions (3,) with standard deviations greater than 0."""
+    """Estimates a point's motion in levelled axes from measured positions (3,) with positive standard deviations."""
 
     def __init__(
         self,

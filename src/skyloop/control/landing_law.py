@@ -4,9 +4,9 @@ A filter for straight motion and steady turns (:mod:`.kalman`) tracks the marker
 its own motion (:mod:`.response`), the vehicle flies to where the marker will be when the set-point takes effect and
 matches its velocity and acceleration. It descends while it is inside a cone above the marker, as in Saripalli,
 Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the
-cone it first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the image, the
-vehicle flies by prediction. If it would touch down too far off, it aborts and climbs along the marker's predicted path.
-After a number of aborted attempts it gives up and hovers at a safe height.
+cone, the vehicle first closes in, keeping its height or climbing to see more. Once the marker no longer fits into the
+image, the vehicle flies by prediction. If the vehicle would touch down too far from the marker, it aborts and climbs
+along the marker's predicted path. After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class LandingSettings:
     cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
     cone: float = 0.2  #: increase of the cone's radius per metre of height
     view: float = 0.3  #: ratio of offset to height above which the vehicle climbs to see the marker
-    #: Height below which the vehicle relies on the filter and descends even without sight of the marker, provided that
-    #: it is over the marker's centre, matches its speed, and the marker has moved as predicted ``foresight_s`` earlier.
+    #: Height below which the vehicle relies on the filter and descends even if the marker is out of sight, provided
+    #: that it is over the marker's centre at the same speed, and the marker moved as predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
     commit_off_m: float = 0.08
     commit_m_s: float = 0.25
@@ -78,7 +78,7 @@ class LandingSettings:
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
     #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
-    #: ``blind_s``. Just above the marker (``nearly_m``), it is aborted only if the vehicle would miss the platform.
+    #: ``blind_s``. Just above the marker (below ``nearly_m``), only a miss of the platform aborts it.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
@@ -86,12 +86,12 @@ class LandingSettings:
     touch_m: float = 0.03  #: height below which the vehicle counts as touched down
     feet_m: float = 0.06  #: distance of the feet below the body's centre
 
-    #: Marker speed above which the image's longer side is aligned with its motion, to see it for longer.
+    #: Marker speed above which the image's longer side is aligned with its motion, to keep it in view for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
     long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
 
-    fresh_s: float = 0.35  #: time to carry on without a sighting
+    fresh_s: float = 0.35  #: time to continue without a sighting
     recovering_s: float = 4.0  #: time to follow the predicted position of an unseen marker before searching
     search_height_m: float = 2.6  #: height above the ground for searching and for hovering safely
     search_speed_m_s: float = 1.0
@@ -200,7 +200,7 @@ class LandingLaw(AirframeLaw):
         return None if newest is None else float(np.hypot(*newest.velocity[:2]))
 
     def safe(self, now_ns: int) -> bool:
-        """Return whether the law has given up and reached a height at which it is safe to hover."""
+        """Return whether the law has given up and the vehicle has reached a safe height for hovering."""
         if self._gave_up_ns is None:
             return False
         altitude = self.airframe.altitude_m(now_ns)
@@ -291,7 +291,7 @@ class LandingLaw(AirframeLaw):
         return clamped(1.5 * error, s.turn_rad_s)
 
     def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
-        """Return the marker's motion relative to the vehicle; None if it has never been seen or not recently."""
+        """Return the marker's motion relative to the vehicle; None if it was never seen, or not recently."""
         s = self.settings
         if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
             return None
@@ -394,7 +394,7 @@ class LandingLaw(AirframeLaw):
         return clamped(max(0.0, off / s.view - height), s.climb_m_s)
 
     def _searched(self, own: Motion, now_ns: int) -> Array:
-        """Return the search velocity: first wait at the marker's last position, or here, then fly the spiral."""
+        """Return the search velocity: wait at the marker's last position or, if unknown, here; then fly the spiral."""
         s = self.settings
         if self._searching_ns is None:
             self._searching_ns = now_ns
@@ -417,7 +417,7 @@ class LandingLaw(AirframeLaw):
 
 
 def _then(newest: Motion, ahead: Predicted) -> Motion:
-    """Return the vehicle's motion when a set-point sent now takes effect."""
+    """Return the vehicle's predicted motion at the time when a set-point sent now takes effect."""
     dt = seconds(ahead.at_ns - newest.at_ns)
     position = newest.position + np.array([*ahead.moved, newest.velocity[2] * dt])
     velocity = np.array([*ahead.velocity, newest.velocity[2]])
@@ -445,7 +445,7 @@ class SpiralSearch:
         self._leg, self._goal = 0, None
 
     def step(self, position: Array) -> Array:
-        """Return the wanted velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
+        """Return the desired velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
         if self._goal is None:
             self._begin = self._goal = position.copy()
         way = self._goal - position

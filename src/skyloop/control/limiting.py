@@ -86,7 +86,7 @@ class SetpointLimiter:
 
         Args:
             wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); non-finite values count as 0.
-            dt_s: Time since the last call; at most 0.2 s are counted, so that a pause does not allow a larger step.
+            dt_s: Time since the last call; capped at 0.2 s, so that a pause does not allow a larger step.
         """
         limits, dt = self.limits, within(dt_s, 0.0, _LONGEST_STEP_S)
         result = np.nan_to_num(np.asarray(wanted, dtype=np.float64), posinf=0.0, neginf=0.0)
@@ -104,7 +104,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Restart from a set-point; with None, the next change is not limited."""
+        """Restart from a set-point; if it is None, the next change is not limited."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

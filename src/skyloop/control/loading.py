@@ -27,7 +27,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
     """Load the controller class from a Python file; the class name is only needed if there are several.
 
     The file is executed and, like a script, can import modules from its own folder. Imported classes are considered
-    only if the file itself defines no controller. FileFormatError states the line that can't be executed.
+    only if the file itself defines no controller. A :class:`FileFormatError` states the line that can't be executed.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source, because Python's cache treats files with the same size and second as unchanged."""
+    """Always compiles the source: Python's cache misses changes of the same size within the same second."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -91,7 +91,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Return the line of the user's file that raised an exception, as text; empty if it was raised elsewhere."""
+    """Return the text of the line in the user's file that raised an exception; empty if raised elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -144,7 +144,7 @@ class Reloader:
 
     @property
     def waiting(self) -> bool:
-        """Whether :meth:`take` has something to return."""
+        """Whether :meth:`take` has anything to return."""
         return bool(self._loaded)
 
     @property
@@ -180,7 +180,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Reload the file and the modules in its folder; on failure, restore those loaded before."""
+        """Reload the file and the modules in its folder; on failure, restore the previously loaded modules."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -213,7 +213,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None if the file is missing, for example during its replacement."""
+    """Return a stamp that changes with each save; None if the file is missing, for example during a save."""
     try:
         found = file.stat()
     except OSError:

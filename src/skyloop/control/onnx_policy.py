@@ -229,10 +229,10 @@ _ACTIONS: Final = " or ".join(f"{kind} ({', '.join(names)})" for kind, names in 
 class OnnxPolicy(Behaviour):
     """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
-    The proxy's limits, zones and failsafe apply as for any application. The vehicle hovers, and an event reports why,
-    if no frames arrive, if a state value that the network needs is missing or half a second old, or if the action is
-    not finite. In each case the network's memory is cleared. The vehicle must be airborne when :meth:`run` is called.
-    All callbacks run on the thread that called it.
+    The proxy's limits, zones and failsafe apply as they do for any application. The vehicle hovers, and an event
+    reports why, if no frames arrive, if a state value that the network needs is missing or half a second old, or if the
+    action is not finite. In each case the network's memory is cleared. The vehicle must be airborne when :meth:`run` is
+    called. All callbacks run on the thread that called :meth:`run`.
     """
 
     name = "policy"
@@ -255,7 +255,7 @@ class OnnxPolicy(Behaviour):
             path: The ONNX file; see :class:`PolicyNetwork`.
             camera: Camera to use; None for the camera named in the file.
             state: Names of the state values, if not stated in the file.
-            action: ``velocity`` or ``attitude``, if not stated in the file.
+            action: ``velocity`` or ``attitude``; needed if the file does not state which.
             threads: CPU threads for one image.
 
         Raises:
@@ -272,7 +272,7 @@ class OnnxPolicy(Behaviour):
 
     @property
     def phase(self) -> PolicyPhase:
-        """The current phase: whether the policy is flying or why it is not."""
+        """The current phase, which tells whether the policy is flying and, if not, why."""
         return self._phase
 
     def look(self, frame: Frame) -> list[Shape]:

@@ -42,7 +42,7 @@ class MotionProfile:
             self._stretch(length, limit, begin, end, acceleration_m_s2)
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Return the distance covered [m] and the speed [m/s] at a time; at rest before 0 and after the end."""
+        """Return the distance covered [m] and the speed [m/s] at a given time; at rest before 0 and after the end."""
         if t_s <= 0.0 or not self._pieces:
             return 0.0, 0.0
         if t_s >= self.duration_s:
@@ -97,10 +97,10 @@ class Path(Protocol):
     def duration_s(self) -> float: ...
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m]."""
+        """Return the position at a given time [s], shape (3,) [m]."""
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]."""
+        """Return the velocity at a given time [s], shape (3,) [m/s]."""
 
 
 class FunctionPath:
@@ -121,7 +121,7 @@ class FunctionPath:
         Args:
             position: A function that returns x, y, z [m] at a time from 0 to ``duration_s``.
             duration_s: Duration of the path.
-            velocity: A function that returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
+            velocity: A function of time that returns x, y, z [m/s]; None to differentiate ``position`` numerically.
 
         Raises:
             UsageError: The duration is not between 1e-6 and 1e6 s.
@@ -131,7 +131,7 @@ class FunctionPath:
         self._velocity = velocity
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m].
+        """Return the position at a given time [s], shape (3,) [m].
 
         Raises:
             UsageError: The function does not return three finite numbers.
@@ -139,7 +139,7 @@ class FunctionPath:
         return _point(self._position(within(t_s, 0.0, self.duration_s)))
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]; 0 before the start and after the end.
+        """Return the velocity at a given time [s], shape (3,) [m/s]; 0 before the start and after the end.
 
         Raises:
             UsageError: A function does not return three finite numbers.
@@ -209,12 +209,12 @@ class Polyline(_Profiled):
         self._begins = np.cumsum([0.0, *(piece.length for piece in self._pieces)])
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m]."""
+        """Return the position at a given time [s], shape (3,) [m]."""
         piece, way, _ = self._at(t_s)
         return piece.point(way)
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]."""
+        """Return the velocity at a given time [s], shape (3,) [m/s]."""
         piece, way, speed = self._at(t_s)
         return piece.direction(way) * speed
 
@@ -262,12 +262,12 @@ class Circle(_Profiled):
         self._profile = MotionProfile([(length, speed)], acceleration)
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m]."""
+        """Return the position at a given time [s], shape (3,) [m]."""
         angle, _ = self._angle(t_s)
         return self._centre + self._radius * np.array([math.cos(angle), math.sin(angle), 0.0])
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]."""
+        """Return the velocity at a given time [s], shape (3,) [m/s]."""
         angle, speed = self._angle(t_s)
         return self._sense * speed * np.array([-math.sin(angle), math.cos(angle), 0.0])
 
@@ -312,12 +312,12 @@ class Lemniscate(_Profiled):
         self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m]."""
+        """Return the position at a given time [s], shape (3,) [m]."""
         u, _ = self._profile.at(t_s)
         return self._centre + self._turn @ (self._a * np.array([math.sin(u), math.sin(u) * math.cos(u), 0.0]))
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]."""
+        """Return the velocity at a given time [s], shape (3,) [m/s]."""
         u, rate = self._profile.at(t_s)
         along: Array = self._turn @ (self._a * rate * np.array([math.cos(u), math.cos(2 * u), 0.0]))
         return along
@@ -357,11 +357,11 @@ class Spline:
         self.duration_s = float(times[-1])
 
     def position(self, t_s: float) -> Array:
-        """Return the position at a time [s], shape (3,) [m]."""
+        """Return the position at a given time [s], shape (3,) [m]."""
         return np.asarray(self._curve(within(t_s, 0.0, self.duration_s)), dtype=np.float64)
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]."""
+        """Return the velocity at a given time [s], shape (3,) [m/s]."""
         return np.asarray(self._slope(t_s), dtype=np.float64) if 0.0 <= t_s <= self.duration_s else np.zeros(3)
 
 

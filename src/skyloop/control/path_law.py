@@ -2,7 +2,7 @@
 
 The path's velocity is fed forward with the vehicle's response time as lead, and a PI controller for the position
 removes the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund,
-"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so
+"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at its time of measurement, so
 delays cause no error.
 """
 
@@ -35,7 +35,7 @@ _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
 _SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
 _ALONG_M_S = 0.05  # minimum speed for the direction of flight to determine the yaw
 _NEAR_M = 0.3  # minimum horizontal distance to a point for its bearing to be reliable
-_AHEAD_S = 0.1  # interval for computing the rate of the wanted yaw
+_AHEAD_S = 0.1  # interval for computing the rate of the desired yaw
 
 
 class YawMode(Protocol):
@@ -68,7 +68,7 @@ class FixedYaw:
 
 @dataclass(frozen=True, slots=True)
 class AlongPath:
-    """Yaw along the direction of flight plus ``offset`` [rad], unchanged while the vehicle hovers or only climbs."""
+    """Yaw to face along the path, plus ``offset`` [rad]; the yaw is kept while the vehicle hovers or only climbs."""
 
     offset: float = 0.0
 
@@ -81,7 +81,7 @@ class AlongPath:
 
 @dataclass(frozen=True, slots=True)
 class LookAt:
-    """Yaw towards a point, x and y in world axes [m], unchanged while the vehicle is above or below it."""
+    """Yaw to face a point, x and y in world axes [m]; the yaw is kept while the vehicle is above or below the point."""
 
     x: float
     y: float
@@ -103,10 +103,10 @@ class PathSettings:
     #: Gains for the position error [1/s, 1/s²]; ``velocity_gain`` replaces the derivative gain.
     gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))
     #: Fraction of the velocity error that is added to the set-point if the velocity is known. Vehicles with a soft
-    #: velocity loop then respond sooner and are pushed less far by gusts.
+    #: velocity loop then respond sooner, and gusts push them less far.
     velocity_gain: float = 1.0
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.25  #: the vehicle's response time, by which the velocity is fed forward
+    lead_s: float = 0.25  #: the vehicle's response time; velocity is fed forward to compensate for it
     limits: SetpointLimits = field(
         default_factory=lambda: SetpointLimits(
             speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0
@@ -150,7 +150,7 @@ class PathLaw:
         Args:
             path: The path, in world axes.
             settings: Settings for the control law; None for the defaults.
-            yaw: The yaw mode; None keeps the yaw of the first fix.
+            yaw: The yaw mode; None to keep the yaw of the first fix.
         """
         self.settings = settings or PathSettings()
         self.time_s = 0.0  #: current time on the path
@@ -162,7 +162,7 @@ class PathLaw:
         self._limiter = SetpointLimiter(limits)
         self._last: Fix | None = None
         self._wanted_yaw: float | None = None
-        self._turning = 0.0  # rate of the wanted yaw [rad/s]
+        self._turning = 0.0  # rate of the desired yaw [rad/s]
 
     @property
     def over(self) -> bool:
@@ -179,20 +179,20 @@ class PathLaw:
 
         Args:
             path: The path, in world axes.
-            yaw: The new yaw mode; None keeps the current one.
+            yaw: The new yaw mode; None to keep the current one.
         """
         self._path, self.time_s = path, 0.0
         if yaw is not None:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Pause the path because the vehicle hovers or another client flies it; restart from rest without integral."""
+        """Pause the path because the vehicle hovers or another client flies it; restart at rest, with no integral."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None
 
     def there(self, fix: Fix) -> bool:
-        """Return whether the path's time is up and the vehicle is at its end with the wanted yaw."""
+        """Return whether the path's time is up and the vehicle is at its end with the desired yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
@@ -224,12 +224,12 @@ class PathLaw:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
-        """Advance the path's time, more slowly beyond the leash and not at all beyond twice the leash."""
+        """Advance the path's time; slow down beyond the leash, and stop beyond twice the leash."""
         share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 
     def _turn(self, fix: Fix) -> float:
-        """Return the wanted yaw rate [rad/s]."""
+        """Return the desired yaw rate [rad/s]."""
         position, velocity = self.target
         if self._yaw is not None:
             later = self.time_s + _AHEAD_S
@@ -241,7 +241,7 @@ class PathLaw:
         return self._turning + self.settings.yaw_gain * wrap_angle(self._wanted_yaw - fix.yaw_rad)
 
 
-APPROACH_M_S: Final = 0.5  #: speed on the way to the start of a path
+APPROACH_M_S: Final = 0.5  #: speed while flying to the start of a path
 
 
 @dataclass(slots=True)
@@ -367,7 +367,7 @@ class FollowPath(_PathFlyer):
         Args:
             drone: The drone to fly.
             path: The path, in world axes.
-            yaw: A :class:`skyloop.control.YawMode`; None keeps the current yaw.
+            yaw: A :class:`skyloop.control.YawMode`; None to keep the current yaw.
             settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
             max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.
@@ -428,7 +428,7 @@ class Waypoints(_PathFlyer):
             speed_m_s: Maximum speed between waypoints.
             acceleration_m_s2: Acceleration at the start and end of each leg.
             hold_s: Time to stay at each waypoint.
-            yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None keeps the current yaw.
+            yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None to keep the current yaw.
             settings: Settings for the control law; None for the defaults.
             source: Position source; None for the vehicle's own feedback.
             max_age_s: Maximum age of positions; the vehicle hovers if the newest one is older.

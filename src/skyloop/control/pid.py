@@ -101,7 +101,7 @@ class Pid:
             slope = self._slope.value or 0.0
             self._integral += (old.p - new.p) * self._error - (old.d - new.d) * slope
         elif old.i > 0.0:
-            self._integral = 0.0  # without an integral gain, it would stay forever
+            self._integral = 0.0  # without an integral gain, the term would never change
         self._slope.time_constant_s = new.derivative_filter_s
         self._gains = new
 
@@ -114,7 +114,7 @@ class Pid:
         """Compute the output for a new measurement.
 
         Args:
-            set_point: The wanted value.
+            set_point: The desired value.
             measured: The measured value, in the same unit.
             dt_s: Time since the last measurement [s].
             feed_forward: Value added to the output before the limits are applied.
@@ -142,7 +142,7 @@ class Pid:
     def applied(self, output: float) -> None:
         """Report the output that was actually applied, in case a limit outside this controller reduced it.
 
-        The integral term follows it (back-calculation). :meth:`step` calls this method with its own limited output.
+        The integral follows that output (back-calculation). :meth:`step` calls this with its own limited output.
 
         Args:
             output: The applied output.
@@ -182,7 +182,7 @@ class VectorPi:
         """Initialise the controller.
 
         Args:
-            gains: The gains, of which the derivative gain and ``tracking_s`` are unused.
+            gains: The gains; the derivative gain and ``tracking_s`` are not used.
             dimensions: Length of the vector.
             most: Maximum magnitude of the integral term.
         """

@@ -1,8 +1,8 @@
 """A model of how a vehicle responds to velocity set-points, used to predict its motion and invert the response. Pure.
 
-The model of the vehicle's own velocity loop is this: ``delay_s`` after a set-point was sent, the loop demands a lean
-proportional to the velocity error, plus a trim. The lean follows with the lag ``lag_s`` and accelerates the vehicle, as
-does the push of the air. The lean is known from the attitude. A Kalman filter for velocity and push attributes the
+The vehicle's own velocity loop is modelled as follows: ``delay_s`` after a set-point was sent, the loop demands a lean
+proportional to the velocity error, plus a trim. The lean follows with a lag of ``lag_s`` and accelerates the vehicle;
+so does the push of the air. The lean is known from the attitude. A Kalman filter for velocity and push attributes the
 remaining acceleration to the push; the trim is the part of the lean that the velocity error does not explain. The model
 includes all set-points in transit, so a control law can use the velocity that the vehicle will have when its set-point
 takes effect, with gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with Dead
@@ -35,7 +35,7 @@ _KEPT_SETPOINTS = 64  # number of recent set-points to keep
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop, by default that of the AR.Drone according to public sources."""
+    """The response of a vehicle's velocity loop; the defaults describe the AR.Drone, from public sources."""
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
     lag_s: float = 0.1  #: time constant of the lean; Engel, Sturm and Cremers, IROS 2012, give a rate of 10 1/s
@@ -58,13 +58,13 @@ class ResponseSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The predicted motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0."""
+    """The predicted motion when a set-point sent now takes effect. Axes are horizontal, with x along yaw 0."""
 
     at_ns: int  #: time at which the set-point takes effect
     moved: Array  #: distance moved since the last feedback, (2,) [m]
     velocity: Array  #: velocity, (2,) [m/s]
     push: Array  #: acceleration caused by the air, (2,) [m/s²]
-    trim: Array  #: acceleration that the loop demands in addition to the velocity error's, (2,) [m/s²]
+    trim: Array  #: acceleration that the loop demands in addition to its response to the velocity error, (2,) [m/s²]
 
 
 class VelocityResponse:
@@ -73,7 +73,7 @@ class VelocityResponse:
     def __init__(self, settings: ResponseSettings | None = None) -> None:
         """Initialise the model."""
         self.settings = settings or ResponseSettings()
-        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: time of effect, velocity
+        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: time of effect and velocity
         self._at_ns: int | None = None
         self._velocity = np.zeros(2)
         self._push = np.zeros(2)
@@ -115,7 +115,7 @@ class VelocityResponse:
         self._setpoints.append((now_ns + nanoseconds(self.settings.delay_s), np.asarray(velocity, dtype=np.float64)))
 
     def predict(self, now_ns: int) -> Predicted | None:
-        """Predict the motion at the time when a set-point sent now takes effect; None before the first feedback."""
+        """Predict the motion for the time at which a set-point sent now takes effect; None before any feedback."""
         if self._at_ns is None:
             return None
         end_ns = now_ns + nanoseconds(self.settings.delay_s)

@@ -54,7 +54,7 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class Look(_Part, frozen=True, tag_field="do", tag="look"):
-    """Turn to a yaw, or towards a point (x, y)."""
+    """Turn to a given yaw, or towards a point (x, y)."""
 
     yaw: Angle | None = None
     at: Point | None = None
@@ -72,7 +72,7 @@ class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
 
 
 class Photo(_Part, frozen=True, tag_field="do", tag="photo"):
-    """Save a frame from a camera, by default from the vehicle's first one."""
+    """Save a frame from a camera, by default the vehicle's first camera."""
 
     camera: Name | None = None
 
@@ -87,7 +87,7 @@ class RouteWaypoint(_Part, frozen=True):
     y: Metres  #: north [m]
     z: Metres  #: up [m]
     speed: Speed | None = None  #: maximum speed to this waypoint [m/s]; None for the route's speed
-    yaw: Angle | None = None  #: yaw to turn to before arrival [rad]; None keeps the current yaw
+    yaw: Angle | None = None  #: yaw to turn to before arrival [rad]; None to keep the current yaw
     look_at: Point | None = None  #: point (x, y) [m] to face, as an alternative to a fixed yaw
     actions: Annotated[tuple[Action, ...], msgspec.Meta(max_length=16)] = ()  #: actions to perform, in order
 
@@ -121,9 +121,9 @@ class Route(_Part, frozen=True, kw_only=True):
     #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
     name: Name = ""  #: A human-readable name
-    speed: Speed = 0.5  #: maximum speed to waypoints without their own [m/s]
-    #: what to do after the last waypoint: ``hover``, ``land`` or ``return``, which means to fly back to the start of
-    #: the route at the last waypoint's height and land there
+    speed: Speed = 0.5  #: maximum speed to waypoints that don't set their own [m/s]
+    #: what to do after the last waypoint: ``hover``, ``land`` or ``return`` (fly back to the start of the route at the
+    #: last waypoint's height and land there)
     end: Literal["hover", "land", "return"] = "hover"
     version: Literal[1] = VERSION  #: version of the file format
 
@@ -133,18 +133,18 @@ class Route(_Part, frozen=True, kw_only=True):
             raise UsageError("a route needs at least one waypoint")
 
     def speed_to(self, index: int) -> float:
-        """Return the maximum speed to a waypoint [m/s]; an index past the last waypoint means the way back."""
+        """Return the maximum speed to a waypoint [m/s]; an index past the last waypoint means the return flight."""
         own = self.waypoints[index].speed if index < len(self.waypoints) else None
         return self.speed if own is None else own
 
     def to_json(self) -> bytes:
-        """Return the content of the route's file."""
+        """Return the contents of the route's file."""
         plain: dict[str, Any] = {"version": self.version, **msgspec.to_builtins(self)}
         return msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of a file; if it is not a route, UsageError says where and why."""
+    """Read a route from the contents of a file; if it is not a route, UsageError says where and why."""
     try:
         return checked(msgspec.json.decode(content, type=Route))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -175,7 +175,7 @@ def save_route(route: Route, path: str | Path) -> None:
 
 
 def checked(route: Route) -> Route:
-    """Return the route after checking that all numbers are in range, also in routes built by a program."""
+    """Return the route after checking that all numbers are in range, even if a program built the route."""
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
     except msgspec.ValidationError as error:
@@ -203,7 +203,7 @@ class Conditions:
 class Finding(msgspec.Struct, frozen=True):
     """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: number from 1 (for a leg, of its end point), or None for the whole route
+    waypoint: int | None  #: number of the waypoint, or of the leg's end point, from 1; None for the whole route
     severity: Literal["error", "warning"]
     reason: str
 
@@ -258,7 +258,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
-    """Check a route against a drone's newest feedback and parameters; waits for the proxy's answer.
+    """Check a route against a drone's newest feedback and parameters. This waits for the proxy's answer.
 
     An observer's connection is enough. The check waits up to ``wait_s`` for the first position.
     """

@@ -88,11 +88,11 @@ class RouteLaw:
     def __init__(self, route: Route) -> None:
         self.route = route
         self.state = RouteState.READY  #: state of the flight
-        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the way back
-        self.problem = ""  #: why the law paused without a request; empty otherwise
+        self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the return flight
+        self.problem = ""  #: reason why the law paused without a request; otherwise empty
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
-        self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun
+        self._arrived = False  # whether the vehicle has reached the waypoint and started the actions there
         self._skipped_all = False  # whether all waypoints were skipped while paused
         self._since_ns: int | None = None  # start of the current action
         self._deadline_ns: int | None = None
@@ -110,7 +110,7 @@ class RouteLaw:
 
     @property
     def goal(self) -> Waypoint:
-        """The next waypoint, or the one the vehicle is at."""
+        """The next waypoint, or the waypoint that the vehicle is at."""
         return self._goals[self.index].goal
 
     # Requests ---------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ def _name(action: Action) -> str:
 
 
 class FlyRoute(Controller):
-    """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the route's end.
+    """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the end of the route.
 
     The vehicle must be airborne when :meth:`run` is called. Each step is published as an event of kind
     ``vehicle_message`` with ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. If

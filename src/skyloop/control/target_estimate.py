@@ -5,12 +5,12 @@ Navigation", Wiley 2001, section 10.3) of the position of the target's foot, its
 and the logarithm of the target's height. Each box provides an azimuth and the slopes to its lower and upper edges. The
 range and its uncertainty are derived from all available cues: the known size of a class or target, the ground below the
 target (if the vehicle knows its own height) and the vehicle's motion, because close objects grow faster. If there is no
-cue, a nominal initial range is assumed. All ranges then scale with it, and the control law keeps the apparent size
-constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object
-tracking and following for unmanned aerial vehicles", SSRR 2013).
+cue, a nominal initial range is assumed. All ranges are then proportional to this initial range, and the control law
+keeps the apparent size constant, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision
+based GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013).
 
-Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level them, so
-that the vehicle's roll and pitch don't move an object. For an edge outside the image, only a bound is known.
+Directions are in *odometry axes* (see :mod:`.airframe`). The attitude at the time of capture is used to level the
+directions, so that the vehicle's roll and pitch don't move an object. Edges outside the image only give bounds.
 """
 
 from __future__ import annotations
@@ -164,9 +164,9 @@ _NEAREST_M: Final = 0.3  # minimum range
 _RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning, from gusts and an inaccurate drag constant
 _LATE_S: Final = 0.5  # maximum age of a useful box
 _ADAPTING: Final = 0.3  # weight of a single box in the average surprise
-_USUAL: Final = 1.5  # maximum surprise that counts as noise
+_USUAL: Final = 1.5  # maximum surprise that is still attributed to noise
 _MOST_SURPRISE: Final = 4.0  # maximum contribution of a single box to the average surprise
-_STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move straight on
+_STRAIGHT_S: Final = 4.0  # maximum time over which an unseen target is assumed to move in a straight line
 _GONE_S: Final = 0.2  # minimum time out of view before a target counts as hidden ...
 _GONE_INTERVALS: Final = 2.5  # ... and the minimum time in intervals between boxes
 _BEFORE_S: Final = 0.2  # time before a loss at which boxes are assumed to be unoccluded
@@ -191,8 +191,8 @@ class Traits:
     radius_m: float = 0.0  #: distance from the target's centre to its visible lower edge
     #: intensity of the random acceleration; its square root is the typical velocity change in one second
     intensity_m2_s3: float = 1.0
-    #: Whether the target is on the ground. If None, this is assumed for targets with a class; for others it is one of
-    #: several hypotheses (:mod:`.target_range`).
+    #: Whether the target is on the ground. If None, targets with a class are assumed to be on the ground; for others
+    #: this is one of several hypotheses (:mod:`.target_range`).
     on_ground: bool | None = None
 
     def __post_init__(self) -> None:
@@ -204,7 +204,7 @@ class Traits:
                 raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
 
 
-#: Traits by class name, with the typical spread of heights. A bus is not a car.
+#: Traits by class name, with the typical spread of heights. Buses and cars are separate classes.
 TRAITS: Final = {
     "person": Traits(height_m=1.74, height_share=0.06, radius_m=0.25, intensity_m2_s3=0.6),
     "car": Traits(height_m=1.45, height_share=0.2, radius_m=1.2, intensity_m2_s3=3.0),
@@ -249,7 +249,7 @@ class TargetEstimator:
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
         """Initialise the filter; ``nominal_m`` is the initial range if there is no cue.
 
-        With ``relative``, the vehicle's own velocity comes from dead reckoning, and its changing error adds to the
+        With ``relative``, the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
         target's motion.
         """
         self.traits = traits  #: prior knowledge about the target
@@ -309,7 +309,7 @@ class TargetEstimator:
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
         """Start from a first box at a guessed range, with the target size that explains the box.
 
-        ``share`` is the relative standard deviation of the range. Foot position and height scale with the range.
+        ``share`` is the relative standard deviation of the range. The foot's position and height scale with it.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -360,7 +360,7 @@ class TargetEstimator:
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box and return whether it was used; boxes over half a second older than the newest are not.
+        """Update with a box and return whether it was used; ignore boxes over half a second older than the newest.
 
         Edges far from where they are expected count as hidden and are ignored. Boxes in other directions are refused.
         """
@@ -392,7 +392,7 @@ class TargetEstimator:
     def at(self, at_ns: int) -> TargetState:
         """Predict the target's state; motion continues for at most four seconds, but the uncertainty keeps growing.
 
-        For a hidden target, the motion shortly before the loss is used, because the occluder cut off its last boxes.
+        For a hidden target, the motion shortly before the loss is used, because the occluder cut off the latest boxes.
         """
         if self.seen_ns is None:
             raise UsageError("no target yet: call start() with its first box")
@@ -412,11 +412,11 @@ class TargetEstimator:
         )
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a new filter, not started yet, for the same target once it comes back into view."""
+        """Return a new filter for the same target, to be started once the target is back in view."""
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
-        """Return the predicted state and covariance for a time.
+        """Return the predicted state and covariance for a given time.
 
         For times shortly before the newest box (detections from other processes arrive late), the state is moved back
         and the covariance stays the same.

@@ -1,10 +1,10 @@
 """Find a target in a series of images by means of a box tracker and, if there is a detector, its detections.
 
 The finder uses no drone, thread or clock; call it from one thread only. The tracker
-(:class:`skyloop.vision.LongTermTracker`) knows the target's appearance, and the scene (:mod:`.target_scene`) knows
+(:class:`skyloop.vision.LongTermTracker`) models the target's appearance, and the scene (:mod:`.target_scene`) models
 where all objects are and how they move. Each can find the target when the other fails. To avoid confusion, the
-tracker's box must be where the target can be. After a loss, a new object must also be there and be the only one that
-looks like the target.
+tracker's box must be where the target can be. After a loss, a new object must also be where the target can be, and must
+be the only one that looks like the target.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, 
 _SAME: Final = 0.4  # minimum overlap of two boxes that show the same object
 _POINTED_AT: Final = 0.3  # minimum overlap between the user's box and the detection that it selects
 _TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are sharper
-_BESIDE_LATE: Final = 0.25  # the same when late detections provide the size, because the tracker's size drifts
-_TAKEN: Final = 0.5  # fraction of the tracker's box inside another object's box at which it shows that object
+_BESIDE_LATE: Final = 0.25  # tracker noise when late detections provide the size, because the tracker's size drifts
+_TAKEN: Final = 0.5  # if this fraction of the tracker's box is inside another object's box, it contains that object
 _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
 _DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
 _LATELY_S: Final = 1.0  # time to keep clear of other objects after they were last seen
 _DORMANT_S: Final = 1.0  # time out of view after which the target must be recognised again
-_SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be it
+_SIMILAR: Final = 1.6  # maximum mean colour difference between the target and a newcomer that may be the target
 _LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
 _LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to determine the newcomer's motion
 _LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
@@ -99,7 +99,7 @@ class TargetFinder:
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
         self._middle: tuple[float, float] | None = None  # expected position of the target in the newest image [px]
         self._doubts = 0
-        self._twin_ns: int | None = None  # last time when a look-alike was in view in addition to the target
+        self._twin_ns: int | None = None  # last time when both the target and a look-alike were in view
         self._newcomers: dict[int, tuple[int, float]] = {}  # number of images, mean colour difference from the target
         self._ground = False  # whether the camera's height above the ground is known in the newest image
         self._agreed = 0  # number of consecutive images in which tracker and detector agree
@@ -136,7 +136,7 @@ class TargetFinder:
         """Use detections that arrive after their image was processed; return whether they show or may show the target.
 
         If the tracker missed the target in that image or found it elsewhere, it restarts from the detection. Detections
-        are ignored if their image is not among the last ones passed to :meth:`see`.
+        are ignored if their image is not among the most recent images passed to :meth:`see`.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
@@ -255,7 +255,7 @@ class TargetFinder:
         return True
 
     def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
-        """Return whether the detector allows the tracker's box to be the target's.
+        """Return whether, according to the detector, the tracker's box may be the target's.
 
         The tracker may get stuck on an object that hides the target. If the detector knows the target, the tracker is
         therefore trusted only between searched images, and only for a second.
@@ -364,7 +364,7 @@ class TargetFinder:
             return  # the candidates are indistinguishable
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
-        # The first boxes of a reappearing object also show the occluder, so keep the old colours.
+        # The first boxes of a reappearing object also contain part of the occluder, so keep the old colours.
         found.looks, found.hits = target.looks, target.hits + found.hits
         self._adopt(scene, found, frame, back=True)
         del scene.objects[target.number]
@@ -379,7 +379,7 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Return whether a newcomer moves like the target and, if there is a look-alike, is where it is expected."""
+        """Return whether a newcomer moves like the target and, if there is a look-alike, appears where expected."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
@@ -399,7 +399,7 @@ class TargetFinder:
         return unsure and not isinstance(thing.estimator, RangeEstimator)
 
     def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
-        """Return a filter that learns the range of an object in a frame; ``back`` means that a lost target returned."""
+        """Return a filter that learns the range of an object in a frame; ``back`` marks the return of a lost target."""
         before = self.estimator
         if isinstance(before, RangeEstimator) and not back:
             return before

@@ -55,26 +55,26 @@ class FollowStatus:
     range_m: float | None = None  #: horizontal distance from the camera to the target
     range_deviation_m: float | None = None
     bearing_rad: float | None = None  #: angle to the target, counter-clockwise from straight ahead
-    speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own
+    speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own speed
     lost_s: float = 0.0  #: time since the last sighting; 0 while the target is in view or before the first sighting
     problem: str = ""  #: why the target can't be followed as requested; empty if it can
     unknown: str = ""  #: unknown part of the vehicle's motion, which makes it hover regardless of the set-point
 
 
 class TargetFollower(AirframeLaw):
-    """Follows a target; to be called from one thread only."""
+    """Follows a target. Call its methods from one thread only."""
 
     def __init__(
         self,
         camera: CameraInfo,  # the camera, including its mounting; it must face forward
         *,
         box: Box | None = None,  # box of the target in the first frame given to :meth:`look`: x, y, width, height [px]
-        # class whose largest object to follow if there is no box; requires detections
+        # if there is no box, the largest object of this class is followed; requires detections
         class_name: str | None = None,
         mode: FollowMode = FollowMode.FOLLOW,  # how to follow the target
         detector: ObjectDetector | None = None,  # detector for every frame, on the thread that calls :meth:`look`
         detects: bool = False,  # whether detections from elsewhere arrive through :meth:`detected`
-        traits: Traits | None = None,  # prior knowledge about the target; None to use that of its class
+        traits: Traits | None = None,  # prior knowledge about the target; None to use the class's
         settings: ChaseSettings | None = None,  # settings for the control law; None for the defaults
     ) -> None:
         """Initialise the follower; raise UsageError if there is no target or the camera does not face forward."""
@@ -152,7 +152,7 @@ class TargetFollower(AirframeLaw):
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
             state = None  # the frame's time is in the future or there is no recent feedback, so the pose is unknown
-        # If the velocity is unknown, the vehicle hovers, so its last position is used.
+        # If the velocity is unknown, the vehicle is hovering, so use its last known position.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
@@ -320,15 +320,15 @@ class FollowTarget(Behaviour):
         Args:
             drone: The drone to fly.
             box: Box of the target in the first frame: x, y, width, height [px].
-            class_name: Class whose largest object to follow if there is no box; requires a detector.
+            class_name: If there is no box, the largest object of this class is followed; requires a detector.
             distance_m: Horizontal distance to keep; None for the distance in the settings.
             bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0 is
                 ahead of it, π behind it. If None, the settings apply, which allow any side by default.
             mode: ``follow``, ``orbit`` or ``look``.
-            detector: Detector that searches every frame, or the name of a processor whose results are detections, such
-                as that of ``skyloop detect``. If None, the target is tracked by appearance only.
-            height_m: The target's height, if known, for estimating its distance; by default, that of its class. If
-                neither is available, the drone only turns until its own motion has revealed the range.
+            detector: Detector that searches every frame, or the name of a processor that returns detections, such as
+                the one started by ``skyloop detect``. If None, the target is tracked by appearance only.
+            height_m: The target's height, if known, for estimating its distance; by default, the typical height of its
+                class. If neither is available, the drone only turns until its own motion has revealed the range.
             traits: All prior knowledge about the target, as an alternative to ``height_m``.
             camera: Camera to use; None for the vehicle's first camera.
             settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.

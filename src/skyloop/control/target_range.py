@@ -5,10 +5,10 @@ only if the target is on the ground: a picture on a wall whose lower edge is jus
 and the filter would be overconfident. Being on the ground is therefore only one of several hypotheses. The others
 assume ranges from near to far, and each has its own filter (T. R. Kronhamn, "Bearings-only target motion analysis based
 on a multihypothesis Kalman filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE
-Proceedings 142(1), 1995). While the vehicle is at rest, all hypotheses fit. Once it has moved, hypotheses with a wrong
-range no longer fit. Vertical motion works best, because targets hardly move vertically. An altimeter that drifts or
-passes over rising ground reports motion that did not happen. For a target that may be off the ground, the camera's
-height is therefore taken from the vehicle's own climb and follows the altimeter only slowly.
+Proceedings 142(1), 1995). While the vehicle is at rest, all hypotheses fit. Once the vehicle has moved, hypotheses with
+a wrong range no longer fit. Vertical motion works best, because targets hardly move vertically. An altimeter that
+drifts or passes over rising ground reports motion that did not happen. For a target that may be off the ground, the
+camera's height is therefore taken from the vehicle's own climb and follows the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ _OF_LATE_S: Final = 2.0  # averaging time for the recent position
 _BASELINE: Final = 0.015  # minimum ratio of the vehicle's displacement to the range before the range is known
 _JUMP_M: Final = 0.15  # maximum sudden change of the vehicle's height ...
 _JUMP_M_S: Final = 1.0  # ... plus this per second; beyond that, the altimeter sees another surface
-_JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter takes for a jump
+_JUMPING_S: Final = 0.5  # maximum time that a filtered altimeter needs to follow a jump
 _STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter if the climb is known
-_APART_M: Final = 3.0  # maximum deviation of altimeter and climb; if larger, the climb is no longer valid
+_APART_M: Final = 3.0  # maximum difference between altimeter and climb; beyond it, the climb is no longer valid
 
 
 class RangeEstimator(TargetEstimator):
@@ -65,7 +65,7 @@ class RangeEstimator(TargetEstimator):
         self._weights = np.ones(0)
         self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground; None once dropped
         self._sight = self._about = np.zeros(3)  # initial line of sight, and recent mean position of the vehicle
-        self._stirred_m = 0.0  # maximum distance from that position so far, across that line of sight
+        self._stirred_m = 0.0  # maximum distance from that position so far, measured across the initial line of sight
         self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
         self._jumped_ns: int | None = None  # time of the last jump of the height
         self._base_m = 0.0  # averaged difference between altimeter and climb [m]
@@ -112,7 +112,7 @@ class RangeEstimator(TargetEstimator):
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
         """Update with a box, as in :meth:`TargetEstimator.update`, and drop hypotheses that no longer fit.
 
-        The filters restart if the measured height jumps, because someone walks under the vehicle, it flies over a table
+        The filters restart if the measured height jumps, because someone walks below, the vehicle flies over a table,
         or its height was unknown. Such apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:
@@ -175,7 +175,7 @@ class RangeEstimator(TargetEstimator):
         return True if self._known and likeliest is self._on_ground else None
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a new filter, not started yet, for the same target once it comes back into view."""
+        """Return a new filter for the same target, to be started once the target is back in view."""
         before, stands = self.at(at_ns), self.on_ground
         traits = self.traits if stands is None else replace(self.traits, on_ground=stands)
         return RangeEstimator(
@@ -251,7 +251,7 @@ def _off_climb(camera: Camera) -> float:
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Create a filter for a target, not started yet; ``class_name`` is None for a box drawn by a user."""
+    """Create an unstarted filter for a target; ``class_name`` is None for a box drawn by a user."""
     if traits is not None and (class_name is not None or traits.on_ground is not None):
         return TargetEstimator(traits, nominal_m=nominal_m, relative=relative)
     return RangeEstimator(traits or UNKNOWN, nominal_m=nominal_m, relative=relative)

@@ -1,9 +1,9 @@
-"""Match detections to objects, which keep their identities when they cross, hide and return. Pure.
+"""Match detections to objects, so that objects keep their identities when they cross, hide or return. Pure.
 
 Detections are matched with filtered estimates of the objects' current positions, not with their positions in the last
 image. The vehicle's own motion therefore does not matter, and look-alikes are distinguished by position and motion. The
 pairs form the most likely overall assignment (SciPy's ``linear_sum_assignment``). If two objects explain a detection
-almost equally well, it updates neither. Both then continue on their predicted paths until they separate.
+almost equally well, neither is updated. Both then continue on their predicted paths until they separate.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ Floats = NDArray[np.float32]
 
 _COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b; lighting affects L most
 _OTHER: Final = 10.0  # colour difference between objects; for the same object it is usually below 0.5, sometimes 3
-_OTHER_AGAIN: Final = 3.0  # the same for an object that was briefly out of view
+_OTHER_AGAIN: Final = 3.0  # colour difference above which an object that was briefly out of view counts as another
 _MOMENT_S: Final = 0.3  # time out of view after which _OTHER_AGAIN applies
 _UNLIKE: Final = 3.0  # weight of the colour difference relative to the position
 _LEARNING: Final = 0.05  # learning rate of the colours per detection; the first few are averaged
 _GATE: Final = 9.0  # maximum squared Mahalanobis distance per measurement
 _NEVER: Final = 1e6  # cost of an impossible pair
 _AMBIGUOUS: Final = 4.0  # difference of the doubled negative log-likelihood below which a match is ambiguous
-_LATELY_S: Final = 1.2  # maximum time since an object was last seen for it to explain a detection
+_LATELY_S: Final = 1.2  # maximum time for which an unseen object can still explain a detection
 _TOGETHER_S: Final = 3.0  # time after which two objects detected as one count as one
 _FAR_BEHIND: Final = 1.3  # ratio of ranges above which an object is hidden by another one, not part of its box
 _EARLIER_S: Final = 0.5  # time before a meeting at which velocities are not yet distorted by merging boxes
 _APART_S: Final = 0.6  # time after a separation at which velocities are known again
 _DIFFER_M_S: Final = 0.8  # minimum velocity difference before a meeting for telling two objects apart
-_TURNED: Final = 0.3  # reversed fraction of that difference at which two objects count as confused
+_TURNED: Final = 0.3  # the objects count as confused if this fraction of that difference has reversed
 _KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different object
-_YOUNG_S: Final = 0.5  # the same for objects seen only once
+_YOUNG_S: Final = 0.5  # time to remember hidden objects that were seen only once
 _CONFIRMED: Final = 3  # number of detections needed to confirm an object
 _OF_A_PART: Final = 1.0  # colour difference assumed for objects cut off by the image
 _SETTLED: Final = 8  # number of detections after which an object can contest others; new ones may be two in one
@@ -114,7 +114,7 @@ class _Seen(NamedTuple):
 def unlikeness(one: Floats, other: Floats) -> float:
     """Return the squared colour difference of two objects, in units of the usual variation due to light and folds.
 
-    ``other`` is either (6,) or contains the colours of n strips of a box, (n, 6), of which the most similar is used.
+    ``other`` contains the colours of one box, (6,), or of n strips of a box, (n, 6); the most similar strip is used.
     """
     return float(np.min(_unlike(one, other)))
 
@@ -137,7 +137,7 @@ def _is_about(thing: SceneObject, at_ns: int) -> bool:
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Return whether a detection may show two objects: the other one's centre is in the box and not far behind."""
+    """Return whether a detection may show two objects, because another object's centre is in it, not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box
@@ -153,7 +153,7 @@ class Scene:
     """The detected objects."""
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Initialise an empty scene; ``traits`` by class override :data:`~.target_estimate.TRAITS`."""
+        """Initialise an empty scene; ``traits`` maps classes to traits replacing :data:`~.target_estimate.TRAITS`."""
         self.objects: dict[int, SceneObject] = {}  #: objects by number
         self.kept: set[int] = set()  #: numbers of objects that are never forgotten, however long they are hidden
         #: numbers of objects that are not matched with detections, because their return is decided elsewhere

@@ -34,7 +34,7 @@ class Waypoint:
     x: float  #: east [m]
     y: float  #: north [m]
     z: float  #: up [m]
-    yaw: float | None = None  #: counter-clockwise from x [rad]; None leaves it free
+    yaw: float | None = None  #: counter-clockwise from x [rad]; None to leave it free
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z", "yaw"):

@@ -1,4 +1,4 @@
-"""The tasks as Gymnasium environments for one drone, or many in one simulation, observed as numbers, images or both."""
+"""Gymnasium environments for one drone, or for many in one simulation, observed as numbers, images or both."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
     """Many drones in one simulation, which is many times faster than one simulation per drone.
 
-    Like :class:`TaskEnv`, with a leading axis; a finished episode starts over in the next step
+    Like :class:`TaskEnv`, but with a leading axis; a finished episode starts over in the next step
     (``AutoresetMode.NEXT_STEP``).
     """
 
@@ -231,7 +231,7 @@ class FollowEnv(TaskEnv):
 
 
 class GatesEnv(TaskEnv):
-    """Fly through four gates in order. Rewards are 1 per gate and 1 per metre towards the next; the last ends it."""
+    """Fly through four gates in order. Each gate and each metre of progress earns 1; the last gate ends the episode."""
 
     task = Racing
 
@@ -261,7 +261,7 @@ class GatesVectorEnv(TaskVectorEnv):
 
 
 class View:
-    """Draws one of an arena's drones, and rings, but not the other drones: they share the world only to save time.
+    """Draws rings and one of an arena's drones. Other drones are not drawn: they share the world only to save time.
 
     Raises :class:`MissingExtraError` without OpenCV.
     """

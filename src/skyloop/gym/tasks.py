@@ -54,7 +54,7 @@ class Arena:
     def state(self) -> tuple[Floats, Floats, Floats]:
         """Return the drones' positions in their cells, their velocities and their angles. Do not modify the arrays.
 
-        Positions, (n, 3) [m], and roll, pitch and yaw, (n, 3) [rad], are true values, as motion capture would give;
+        Positions, (n, 3) [m], and roll, pitch and yaw, (n, 3) [rad], are true values, as motion capture would report;
         velocities in the body's levelled axes, (n, 3) [m/s], are the drones' estimates.
         """
         if self._state is None:
@@ -69,7 +69,7 @@ class Arena:
         return self._poses
 
     def airborne(self) -> NDArray[np.bool_]:
-        """Return which drones are flying, shape (n,)."""
+        """Return a mask of the drones that are flying, shape (n,)."""
         return self.simulation.airborne()
 
     def _take_off(self) -> None:
@@ -84,7 +84,7 @@ class Arena:
 
 
 def outside(places: Floats) -> NDArray[np.bool_]:
-    """Return which drones have left their cell, shape (n,)."""
+    """Return a mask of the drones that have left their cell, shape (n,)."""
     wide = np.abs(places[:, :2]).max(axis=1) > REACH_M
     low_or_high = (places[:, 2] < LOWEST_M) | (places[:, 2] > HIGHEST_M)
     found: NDArray[np.bool_] = wide | low_or_high
@@ -116,7 +116,7 @@ GATES: Final = 4
 GATE_RADIUS_M: Final = 0.5
 _GATE_RING_M: Final = 1.8  #: radius of the circle on which the gates are placed
 _FOLLOWING_M: Final = 0.3  #: maximum distance error at which a target counts as followed
-_FOLLOWING_RAD: Final = 0.35  #: maximum bearing of the target at which it counts as followed
+_FOLLOWING_RAD: Final = 0.35  #: maximum bearing at which the target counts as followed
 _SPREAD: Final = (2.0, 2.0, 0.8)  #: greatest distance of goals and starts from the middle of a cell, per axis [m]
 _HEIGHT: Final = 2.0  #: height of the middle of a cell [m]
 _WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from the middle of its cell, per axis [m]
@@ -154,7 +154,7 @@ class Reaching:
 
     @property
     def arena(self) -> Arena:
-        """The drones. Raises :class:`UsageError` before :meth:`begin`."""
+        """The drones. Raises :class:`UsageError` if :meth:`begin` has not been called."""
         if self._arena is None:
             raise UsageError("the environment has not been reset yet: call reset() first")
         return self._arena
@@ -172,14 +172,14 @@ class Reaching:
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
         """Choose a new start and a new goal for these drones."""
-        self.age[which] = 0  # must precede the call of ``_place``, because moving goals depend on the age
+        self.age[which] = 0  # must precede the call to ``_place``, because moving goals depend on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)
         self._before[which] = 0.0
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Return the rewards, which episodes terminated, which were truncated, and further values for each drone."""
+        """Return each drone's reward, whether its episode terminated or was truncated, and further values."""
         bounded = np.minimum(np.maximum(np.where(np.isnan(actions), 0.0, actions), -1.0), 1.0)
         self.arena.step(bounded * _FULL)
         self.age += 1
@@ -227,7 +227,7 @@ class Reaching:
         return start, heading
 
     def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others use it
-        """Return the rewards, which tasks are completed, and further values."""
+        """Return the rewards, flags for completed tasks, and further values."""
         distances = np.linalg.norm(self.goals - places, axis=1)
         rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
         infos: Infos = {"distance_m": distances, "is_success": distances < NEAR_M}
@@ -290,7 +290,7 @@ class Following(Reaching):
 
 
 class Racing(Reaching):
-    """Fly in order through gates placed on a circle; done after the last one."""
+    """Fly in order through gates placed on a circle; the task is done after the last gate."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         super().__init__(drones, seconds, gusts_m_s, vehicle)
@@ -325,7 +325,7 @@ class Racing(Reaching):
         self.headings = np.arctan2(normals[:, 1], normals[:, 0])
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Perform the base class's step, adding 1 for each gate and the distance gained towards the next one."""
+        """Perform the base class's step; reward each gate with 1, and also progress towards the next gate."""
         before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
         rewards, done, over, infos = super().step(actions)
         nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)

@@ -57,7 +57,7 @@ MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callab
 class MotionCapture:
     """Poses of bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
 
-    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True`` they run on the
+    Methods can be called from any thread. Callbacks run on separate threads. With ``inline=True``, callbacks run on the
     receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. Exceptions in
     callbacks are counted and logged and do not affect other callbacks.
 
@@ -196,11 +196,11 @@ class MotionCapture:
     def on_event(self, function: OnEvent, *, inline: bool = False) -> Listener[TrackEvent]:
         """Call ``function`` whenever a body is found or lost, or the system has a problem.
 
-        Return value and exceptions are those of :meth:`on_pose`.
+        The return value and exceptions are the same as for :meth:`on_pose`.
 
         Args:
             function: A function called on a separate thread, for which up to 256 events can wait.
-            inline: Whether to call the function on the thread that detected the change instead.
+            inline: Whether to call the function on the thread that detected the change instead of a separate one.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 
@@ -231,7 +231,7 @@ class MotionCapture:
     # For drones and controllers ---------------------------------------------------------------------------------
 
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
-        """Log a drone's poses on the drone, so that they are recorded and shown in the cockpit.
+        """Log a drone's poses in the drone's log, so that they are recorded and shown in the cockpit.
 
         Loss of tracking is logged too.
 
@@ -258,7 +258,7 @@ class MotionCapture:
             UnknownNameError: ``bodies`` does not contain this name.
         """
         name = drone.name
-        self._track(name)  # raises UnknownNameError here for an unknown name
+        self._track(name)  # raises UnknownNameError early if the name is unknown
 
         def newest() -> Fix | None:
             pose = self.pose(name)
@@ -271,9 +271,9 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between a tracked body's axes and those of a drone that rests on the ground.
+        """Measure the rotation between a tracked body's axes and the axes of a drone that rests on the ground.
 
-        Afterwards, poses of the body are those of the drone. Until then, an earlier calibration remains in force.
+        Afterwards, poses of the body are converted to poses of the drone. Until then, an earlier calibration is used.
 
         Args:
             drone: The drone; its proxy's name must be in ``bodies``.
@@ -340,7 +340,7 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # poses have this age on arrival
+                    track.look(monotonic_ns() - self.latency_ns)  # age of the poses on arrival
                 self._report(track)
 
     def _report(self, track: Track) -> None:
@@ -369,11 +369,11 @@ class MotionCapture:
 
 
 def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
-    """Do nothing, because motion capture has no events for program errors and the listener logs them."""
+    """Do nothing: motion capture has no events for program errors, and the listener logs them."""
 
 
 class Linked:
-    """Logs all poses of a drone on that drone until closed. See :meth:`MotionCapture.link`."""
+    """Logs all poses of a drone in that drone's log until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
         """Initialise without logging, which starts with the ``with`` block."""

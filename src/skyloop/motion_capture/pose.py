@@ -1,9 +1,9 @@
 """Poses from a motion capture system: conversion to Skyloop's axes, tracking over time and calibration. Pure.
 
 The calibration is the rotation between a tracked body's axes, as defined by the system, and those of the drone. The
-procedure is that of MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if
-they vary too much. The drone's own roll and pitch determine its attitude at rest. Its nose must point along the world's
-x axis unless ``heading`` is given.
+The procedure is the same as in MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is
+refused if they vary too much. The drone's own roll and pitch determine its attitude at rest. Its nose must point along
+the world's x axis unless ``heading`` is given.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
 
 
 def plausible(position: Vector, quaternion: Quaternion) -> bool:
-    """Return whether the values can be a pose: they are finite, and the quaternion's norm is within 1 % of 1."""
+    """Return whether the values form a valid pose: they are finite, and the quaternion's norm is within 1 % of 1."""
     if not all(map(math.isfinite, (*position, *quaternion))):
         return False
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
@@ -129,7 +129,7 @@ class Calibration:
     yaw_offset: float | None = None  #: reported yaw minus heading in world axes [rad]; None without a reported yaw
 
     def apply(self, pose: BodyPose) -> BodyPose:
-        """Convert a pose of the tracked body to the drone's pose."""
+        """Convert a pose of the tracked body to a pose of the drone."""
         return replace(pose, quaternion=multiply(pose.quaternion, self.turn))
 
 
@@ -252,7 +252,7 @@ class Track:
         return self.pose
 
     def look(self, now_ns: int) -> bool:
-        """Update the state at a time [ns]; return whether the body has just been lost."""
+        """Update the state for a given time [ns]; return whether the body has just been lost."""
         if self.pose is None or now_ns - self.pose.captured_ns < nanoseconds(LOST_AFTER_S):
             return False
         self.state, self.pose = TrackState.LOST, None

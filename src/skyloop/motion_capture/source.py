@@ -135,7 +135,7 @@ def _latency(address: str, options: dict[str, str]) -> float:
 
 
 def _port_of_host(address: str, parts: SplitResult) -> int | None:
-    """Return the port that follows the host; None if there is none."""
+    """Return the port that follows the host, or None if the address contains no port."""
     try:
         return parts.port
     except ValueError:
@@ -271,7 +271,7 @@ def true_pose(feedback: Feedback) -> tuple[tuple[float, float, float], tuple[flo
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Command of the child process. With ``-m``, Python would warn that the package has already imported this module.
+#: Command of the child process. If run with ``-m``, Python would warn that the module is already imported.
 WORKER: Final = (
     sys.executable,
     "-c",
@@ -279,7 +279,7 @@ WORKER: Final = (
 )
 AGAIN_S: Final = 0.5  #: delay before restarting a child process that ended
 SILENT_S: Final = 3.0  #: time without frames after which a child is killed, because its system may have restarted
-FIRST_S: Final = 10.0  #: the same limit for a child's first frame
+FIRST_S: Final = 10.0  #: the same limit while waiting for a child's first frame
 
 
 class ChildSource:
@@ -298,8 +298,8 @@ class ChildSource:
     ) -> None:
         """Initialise without starting the child.
 
-        ``take`` is called with each frame on the reading thread, and ``trouble`` with a description if the child fails.
-        The system's kind and settings are appended to the command.
+        ``take`` is called with each frame on the reading thread; ``trouble`` is called with a description if the child
+        fails. The system's kind and settings are appended to the command.
         """
         self._system = system
         self._take = take

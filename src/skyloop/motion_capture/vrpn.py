@@ -15,7 +15,7 @@ offset  type   meaning
 ======  =====  ====================================================================================
 
 A description (type -1 for a sender, -2 for a type) has the number in its sender field. Its payload is the name's length
-(u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``. Its
+(u32, including the final NUL) and the name. Poses have the type with the description ``vrpn_Tracker Pos_Quat``. Their
 payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
 
 A client that never sends a UDP port receives everything over TCP.
@@ -46,7 +46,7 @@ TYPE_DESCRIPTION: Final = -2
 DISCONNECT: Final = -5
 POS_QUAT: Final = "vrpn_Tracker Pos_Quat"
 MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes: the buffer size of the reference implementation
-MAX_NAMES: Final = 2_000  #: maximum number of senders and types each, as in the reference implementation
+MAX_NAMES: Final = 2_000  #: maximum number of senders, and of types, as in the reference implementation
 MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 
 HEADER: Final = struct.Struct(">IIIiiI")
@@ -174,7 +174,7 @@ class SensorSelection:
         self._wanted = set(self._bodies.values())
 
     def select(self, poses: Iterable[TrackerPose], now_ns: int) -> dict[str, Seen]:
-        """Return the newest pose of each body, given poses in order of arrival; others are named ``TRACKER:SENSOR``."""
+        """Return the newest pose of each body, given poses in order of arrival; other bodies are ``TRACKER:SENSOR``."""
         poses = list(poses)
         for pose in poses:
             if pose.tracker in self._unnamed:
@@ -194,7 +194,7 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Return whether all reporting trackers have had time to show if they have several sensors."""
+        """Return whether all reporting trackers have had time to reveal further sensors."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property
@@ -251,7 +251,7 @@ class VrpnSource:
         """Close the connection. Idempotent."""
         self._ended.set()
         if self._reader.ident is not None and self._reader is not threading.current_thread():
-            self._reader.join(CONNECT_S + 1.0)  # name lookups may take longer, but they do end
+            self._reader.join(CONNECT_S + 1.0)  # name lookups may take longer, but always end
 
     # --- reader thread ---
 
@@ -266,7 +266,7 @@ class VrpnSource:
             self._ended.wait(AGAIN_S)
 
     def _receive(self) -> None:
-        """Receive over one connection, from its start to its end."""
+        """Receive data over one connection until it ends."""
         address = self._system.host, self._system.port or DEFAULT_PORT
         with socket.create_connection(address, CONNECT_S) as connection:
             connection.settimeout(POLL_S)

@@ -16,11 +16,11 @@ from skyloop.child_process import GRACE_S, ChildProcess, RestartingChild, on_par
 from skyloop.processing.worker import Status, together
 
 _PAUSE_S: Final = 1.0  #: delay before restarting a worker that died
-USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all, after printing the reason
+USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all and has printed the reason
 
 
 class Worker:
-    """The process of a worker, which is restarted when it dies.
+    """A worker's process, which is restarted when it dies.
 
     Args:
         number: Number of the worker for display, from 1.
@@ -31,7 +31,7 @@ class Worker:
 
     def __init__(self, number: int, command: Sequence[str], report: Callable[[str], None], pause_s: float) -> None:
         self.status: Status | None = None
-        self.code: int | None = None  #: exit code, once the worker has exited permanently or can't run at all
+        self.code: int | None = None  #: exit code; set once the worker has exited for good or can't run at all
         self._number = number
         self._report = report
         self._pause_s = pause_s
@@ -55,12 +55,12 @@ class Worker:
 
 
 class Group:
-    """Several children running the same command. A context manager that ends them."""
+    """Several children running the same command. Leaving its ``with`` block ends them."""
 
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
-        """Start ``count`` children; ``tell`` is called on a child's thread with a text when that child dies."""
+        """Start ``count`` children; when one dies, ``tell`` is called with a message on its monitoring thread."""
         self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
 
     @property

@@ -112,7 +112,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """Return the class of that name or, without a name, the only class with a method ``process``."""
+    """Return the class with the given name; if no name is given, return the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -154,7 +154,7 @@ def _source(kind: type[Any]) -> bytes:
 
 _LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
-_KEPT: Final = 1024  #: number of most recent results and frames kept to compute rates and ages
+_KEPT: Final = 1024  #: number of recent results and frames kept for computing rates and ages
 #: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
@@ -165,10 +165,10 @@ class Output:
     __slots__ = ("shapes", "value")
 
     def __init__(self, value: Any, shapes: Iterable[Shape] = ()) -> None:
-        """Combine a value with shapes.
+        """Combine a result with shapes to draw.
 
         Args:
-            value: The result; None publishes nothing.
+            value: The result; None to publish nothing.
             shapes: Shapes in the frame's pixels.
         """
         self.value = value
@@ -186,7 +186,7 @@ class Settings:
     name: str  #: name of the processor and of its results
     code: str  #: identifier of the code, the same for all workers
     camera: str | None = None  #: name of the camera; None for the vehicle's first camera
-    shared: bool = True  #: whether each frame goes to only one worker, instead of to all
+    shared: bool = True  #: whether each frame goes to only one worker rather than to all of them
     max_age_s: float | None = 1.0  #: maximum age of a frame when its turn comes; None for no limit
     max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
     stuck_s: float = 2.0  #: duration of a ``process`` call after which this worker's frames go to the others
@@ -254,7 +254,7 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # frees its memory for the proxy while waiting for the next
+                    del arrival  # frees its memory for the proxy while this thread waits for the next frame
         finally:
             self.membership.close()
 
@@ -296,7 +296,7 @@ class Worker:
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Return whether the worker can take frames, which it can't once a ``process`` call exceeds ``stuck_s``."""
+        """Return whether the worker can take frames: false once a ``process`` call takes longer than ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -318,7 +318,7 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._reported_refusal:  # further results are likely to have the same type
+        if not self._reported_refusal:  # later results are likely to have the same type
             self._reported_refusal = True
             self._emit(f"{self.settings.name}: {error}. Further ones are counted but not reported.")
 
@@ -379,7 +379,7 @@ class Frames:
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
-        """Decode the frame; None if that fails (its channel counts failures)."""
+        """Decode the frame; return None if decoding fails (the frame's channel counts failures)."""
         return (self._channel or self._usual).picture(arrival)
 
     # On the receiving thread, except while entering --------------------------------------------------------------
@@ -415,14 +415,14 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     processor: str
     camera: str
     processes: int = 1  #: number of workers that these statistics cover
-    part: int = 0  #: index of this worker's part of the frames; 0 in statistics of several workers
-    parts: int = 0  #: number of parts, 0 if there is none now; in statistics of several workers, how many have a part
+    part: int = 0  #: index of this worker's share of the frames; 0 if the statistics cover several workers
+    parts: int = 0  #: number of shares, 0 if there are none; in statistics of several workers, workers with a share
     workers: int = 0  #: number of workers of this processor and camera that are known to the proxy
     frames: int = 0  #: number of frames in the worker's part
     results: int = 0
     dropped: int = 0  #: number of frames replaced by newer ones before the worker was ready
     stale: int = 0  #: number of frames that were too old when their turn came
-    errors: int = 0  #: number of ``process`` calls that raised
+    errors: int = 0  #: number of ``process`` calls that raised an exception
     refused: int = 0  #: number of results that can't be sent
     unsent: int = 0  #: number of results that the transport did not accept
     frames_hz: float = 0.0
@@ -454,7 +454,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 def together(found: Iterable[Status]) -> Status | None:
     """Combine the statistics of several workers of one processor; None if there are none.
 
-    Counts and rates are sums; ages are the worst ones.
+    Counts and rates are summed; ages are maxima.
     """
     each = list(found)
     if len(each) < 2:

@@ -61,7 +61,7 @@ _GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:
-    """Return the estimated probability that a box with this score overlaps the target by half or more; monotone."""
+    """Return the estimated probability that a box with this score overlaps the target by half or more; monotonic."""
     return float(np.interp(score, [at for at, _ in _CONFIDENCE], [share for _, share in _CONFIDENCE]))
 
 
@@ -74,11 +74,11 @@ class _State(Enum):
 class LongTermTracker(Tracker):
     """Tracks a target, reports its loss, and finds it again anywhere in the image.
 
-    Another tracker follows the target. Each of its boxes is compared with a memory of the target's appearances, learned
-    from boxes that match well, and with look-alikes seen near it. A box that is not verified is withheld and the target
-    reported as lost. After ten such images the whole image is searched, at one size per image. A place that is similar
-    enough, and clearly more similar than any other place or known look-alike, is tracked on trial and returned after
-    three images.
+    The tracking itself is done by another tracker. Each of its boxes is compared with a memory of the target's
+    appearances, learned from boxes that match well, and with look-alikes seen near it. A box that is not verified is
+    withheld and the target reported as lost. After ten such images the whole image is searched, at one size per image.
+    A place that is similar enough, and clearly more similar than any other place or known look-alike, is tracked on
+    trial and returned after three images.
 
     A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
     new box. The score is the similarity to the closest appearance; ``confidence`` is calibrated on simulated people.
@@ -97,7 +97,7 @@ class LongTermTracker(Tracker):
         self._tracker = tracker()
 
     def shift(self, right: float, down: float) -> None:
-        """Look for the target shifted by this much to the right and down in the next image [px]. Ignored while lost."""
+        """Look for the target shifted by this much to the right and down in the next image [px]. Ignored if lost."""
         if self._shape is not None and self._state is not _State.LOST:
             self._tracker.shift(right, down)
 
@@ -170,7 +170,7 @@ class LongTermTracker(Tracker):
         return TrackResult(seen.box, seen.similarity, confidence(seen.similarity))
 
     def _doubt(self, seen: Candidate | None) -> TrackResult:
-        """Keep an unverified target for a while, but immediately drop one that is on trial or clearly a look-alike."""
+        """Keep an unverified target for a while, but immediately drop a target on trial or a clear look-alike."""
         self._count += 1
         mistaken = seen is not None and _is_other(seen)
         if self._state is _State.ON_TRIAL or mistaken or self._count >= _PATIENCE:
@@ -202,7 +202,7 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Return whether a place clearly contains a look-alike. Only tracking can tell an exact twin apart."""
+    """Return whether a place clearly contains a look-alike. Only tracking can distinguish exact twins."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 
@@ -293,10 +293,9 @@ class TargetMemory:
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Search the whole image for the target [px], using another of its appearances each time.
+        """Search the whole image for the target [px], using a different one of its appearances each time.
 
-        Return up to three of the best places, most similar first, without those that overlap ``besides`` by more than a
-        tenth.
+        Return up to three of the best places, most similar first. Their overlap with ``besides`` is less than a tenth.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
         rows, columns = image.shape[:2]

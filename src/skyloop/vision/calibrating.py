@@ -36,7 +36,7 @@ LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
 GRID: Final = (8, 6)  #: number of cells across and down for measuring coverage
 _WORST_SHARE: Final = 2.5  # views whose error exceeds this many times the median are removed ...
 _WORST_PX: Final = 0.3  # ... and above this
-_NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
+_NEW_SHARE: Final = 0.08  # a view counts as new if its corners have moved by this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
@@ -149,7 +149,7 @@ class Board:
 
 
 class BoardFinder:
-    """Detects one board in images. Keeps OpenCV's working memory, so use one finder per thread.
+    """Detects one board in images. A finder keeps OpenCV's working memory, so use one per thread.
 
     Attributes:
         board: The board to detect.
@@ -227,10 +227,10 @@ class Collector:
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
-        """Select a view if it shows the board in a new place, at a new distance or with a new tilt.
+        """Select a view if it shows the board at a new place, at a new distance or with a new tilt.
 
         Returns:
-            Whether it was selected.
+            Whether the view was selected.
         """
         mark = _mark(view)
         nearest = min((float(np.abs(mark - other).max()) for other in self._marks), default=math.inf)
@@ -336,8 +336,8 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # k3 is left out: estimated from few images, it is mostly noise and bends the image's corners, where there was no
-    # data. Lenses that need k3 are fisheye lenses.
+    # k3 is left out: when estimated from few images, it is mostly noise and distorts the image's corners, where there
+    # are no data. Lenses that need k3 are fisheye lenses.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )
@@ -360,7 +360,7 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """Return a fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
+    """Return OpenCV's fisheye flag. OpenCV 4 has separate flags with different values; OpenCV 5 shares one set."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 

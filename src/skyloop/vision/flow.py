@@ -4,7 +4,7 @@ Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from f
 Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forward and back.
 Each ray is levelled by the attitude and intersected with the ground at the measured height. A corner that was first
 seen from a known position yields the vehicle's current position; the result is the median over all corners. The
-position drifts only as corners leave the image and new ones replace them.
+position drifts only when corners leave the image and are replaced by new ones.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class GroundTracker:
         self._offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m, np.float64)
         self._grey: NDArray[np.uint8] | None = None
         self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
-        self._ground = np.empty((0, 2))  # positions of the corners on the ground, in the axes of `place`
+        self._ground = np.empty((0, 2))  # positions of the corners on the ground, in the same axes as `place`
         self.place = np.zeros(2)  #: the vehicle's position at the last frame: along yaw 0 and to the left [m]
 
     @property
@@ -66,7 +66,7 @@ class GroundTracker:
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
             at_capture: Feedback with the attitude and altitude at the time of capture.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too
@@ -80,7 +80,7 @@ class GroundTracker:
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
         height = at_capture.altitude_m
         known = (height, at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
-        # A value that is not finite would stay in the position forever.
+        # A non-finite value would stay in the position forever.
         if height is None or height < _LOWEST_M or any(one is None or not math.isfinite(one) for one in known):
             self.forget()
             return None

@@ -30,7 +30,7 @@ _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance
 _FARTHEST_M: Final = 8.0  # maximum distance; anything further away is more likely a patch of the same colour
 _SIDE_SHARE: Final = 0.15  # fraction of each side left out at both ends, because corners look rounded
-_FILLED: Final = 0.6  # minimum fraction of the hull: similarly coloured objects behind may reach into the hole
+_FILLED: Final = 0.6  # minimum fraction of the hull; similarly coloured objects behind may reach into the hole
 _OFF_PX: Final = 1.5  # maximum RMS distance between the edge and its four sides
 _LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
 _SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
@@ -43,7 +43,7 @@ class ColourMask:
     """Selects pixels by hue at any brightness, if their saturation is high enough."""
 
     def __init__(self, colour: Rgb) -> None:
-        """Prepare the mask; UsageError for a colour that is invalid or too grey to have a hue."""
+        """Prepare the mask; raise UsageError if the colour is invalid or too grey to have a hue."""
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
             raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
         self._cv = opencv("finding a colour")
@@ -65,7 +65,7 @@ class ColourMask:
 
 @dataclass(frozen=True, slots=True)
 class BlobSighting:
-    """One object of a colour in one image."""
+    """One object of a given colour in one image."""
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: angle of the left edge from the optical axis, positive to the left
@@ -89,7 +89,7 @@ class BlobSighting:
 
 
 class BlobDetector:
-    """Detects connected areas of a colour that are large enough."""
+    """Detects sufficiently large connected areas of a colour."""
 
     def __init__(self, colour: Rgb, least_px: int = 12) -> None:
         """Prepare the detector.
@@ -111,7 +111,7 @@ class BlobDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the widest first.
@@ -169,7 +169,7 @@ class GateDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the nearest first.
@@ -296,7 +296,7 @@ class PoleDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, the widest first.
@@ -325,7 +325,7 @@ class PoleDetector:
         return sorted(found, key=lambda one: -one.width_px)
 
     def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
-        """Return whether something colourful is directly above: probably a gate's bar that hides the top."""
+        """Return whether something colourful is directly above the pole: probably a gate's bar that hides its top."""
         column = min(max(round(x), 0), pixels.shape[1] - 1)
         above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
         return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())

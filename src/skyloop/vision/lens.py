@@ -19,7 +19,7 @@ from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
 _WIDEST = 1e-9  # z divided by distance: a point with a smaller value is not in front of the camera
-_STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little besides its edges
+_STEEPEST = 3.0  # x/z at 72°; a wider ideal camera would show little but its edges
 _DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which the distortion is sampled
 _RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it back
 _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversion
@@ -28,10 +28,10 @@ _ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversi
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image and return its pixels as a plain array, together with its (by default the frame's own) intrinsics.
+    """Check an image; return its pixels as a plain array and its intrinsics, which default to the frame's own.
 
-    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. UsageError for a
-    wrong shape or type, an empty array, or missing intrinsics.
+    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. Raise UsageError
+    if the shape or type is wrong, the array is empty, or the intrinsics are missing.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -117,7 +117,7 @@ def undistort(
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
-        intrinsics: Intrinsics of the camera; None uses the frame's own.
+        intrinsics: Intrinsics of the camera; defaults to the frame's own.
         balance: 0 shows only valid pixels; 1 shows everything that the camera saw, surrounded by black; values in
             between are allowed.
 
@@ -150,9 +150,9 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Return the ideal pinhole's focal length; ``balance`` 0 shows only valid pixels, 1 shows the whole view."""
+    """Return the ideal pinhole's focal length; ``balance`` 0 keeps only valid pixels, and 1 keeps the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
-    reach = []  # for each side: distance from the axis in pixels, divided by its least and by its greatest direction
+    reach = []  # for each side: pixels from the axis, divided by the smallest and by the largest direction along it
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
         side = np.full((len(along), 2), at)
         side[:, 1 - axis] = along
@@ -164,7 +164,7 @@ def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: floa
 
 
 def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z of a pinhole's pixels."""
+    """Return x/z and y/z for the pixels of a pinhole camera."""
     if not len(pixels):
         return np.empty((0, 2))
     cv, given = opencv("removing distortion"), pixels.reshape(-1, 1, 2)

@@ -73,7 +73,7 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 
 
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
-    """Keep the best of several overlapping boxes (left, top, right, bottom), class by class: non-maximum suppression.
+    """Apply non-maximum suppression: of overlapping boxes (left, top, right, bottom) of a class, keep only the best.
 
     Return the indices of the rows to keep, best first. Boxes of a class that overlap by more than ``iou`` count as one.
     """
@@ -127,8 +127,8 @@ class ObjectTracks:
         """Start with no objects.
 
         Args:
-            sure: Minimum score, 0 to 1, for a detection to start a new object. Have the detector return lower scores
-                too (``OnnxDetector(…, score=0.1)``): they keep existing objects alive.
+            sure: Minimum score, 0 to 1, for a detection to start a new object. Have the detector return low scores too
+                (``OnnxDetector(…, score=0.1)``): such detections keep existing objects alive.
             overlap: Minimum overlap of an object's predicted box with a confident detection, 0 to 1.
             overlap_unsure: Minimum overlap with an uncertain detection, 0 to 1.
             confirm: Number of detections after which an object is returned; 1 or more.
@@ -195,7 +195,7 @@ class ObjectTracks:
         corners = np.array([_corners(each.box) for each in detections])
         agreement = np.stack([overlaps(each.corners, corners) for each in objects])
         classes = np.array([[a.detection.class_id == b.class_id for b in detections] for a in objects])
-        # A different class or too little overlap costs more than any sum of allowed pairs.
+        # Pairs of different classes or with too little overlap cost more than any sum of allowed pairs.
         allowed = classes & (agreement > least)
         cost = np.where(allowed, 1.0 - agreement, float(len(objects) + len(detections) + 1))
         pairs = [(int(i), int(j)) for i, j in zip(*self._assign(cost), strict=True) if allowed[i, j]]

@@ -28,8 +28,8 @@ _CHILD: Final = (
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
     """Load a network after a child process has loaded and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
-    Return the exceptions that running it can raise, and ONNX Runtime's session. ``purpose`` is a noun phrase for the
-    error message. FileFormatError if ONNX Runtime can't load the file within the limits.
+    Return the exceptions that a run can raise, and ONNX Runtime's session. ``purpose`` is a noun phrase for the error
+    message. Raises FileFormatError if ONNX Runtime can't load the file within the limits.
     """
     try:
         import onnxruntime
@@ -49,14 +49,14 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
 def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # the exception has the reason
+    options.log_severity_level = 4  # the exception states the reason
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    A tracker of OpenCV takes one or two files and a name; without a name ONNX Runtime loads the file.
+    An OpenCV tracker takes one or two files and a name; if there is no name, ONNX Runtime loads the file.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
@@ -137,4 +137,4 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return an exception's text, shortened and on one line."""
-    return " ".join(str(error).split())[:300]  # OpenCV's `err` belongs to the class and holds the last error anywhere
+    return " ".join(str(error).split())[:300]  # OpenCV keeps `err` on the class; it holds the last error anywhere

@@ -1,10 +1,10 @@
 """Detectors of the YOLO and DETR families, loaded from a user's ONNX file and run on the CPU by ONNX Runtime.
 
 A network's family is recognised by the layout of its outputs.
-YOLOv5 and v7 return rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 the same, transposed and
-without objectness; YOLOv10 and other exports that need no suppression return corners, score and class. YOLOX returns
-offsets on the grid of its strides, unless exported with ``--decode_in_inference``. DETR's descendants return boxes as
-fractions of the image, together with logits or scores.
+YOLOv5 and v7 return rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 return the same, transposed
+and without objectness; YOLOv10 and other exports that need no suppression return corners, score and class. YOLOX
+returns offsets on the grid of its strides, unless exported with ``--decode_in_inference``. DETR's descendants return
+boxes as fractions of the image, together with logits or scores.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def describe(outputs: Outputs) -> str:
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
     """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
 
-    FileFormatError if they fit none of the families, or more than one. ``classes`` is the number of known class names.
+    Raises FileFormatError if the outputs fit no family or several. ``classes`` is the number of class names.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -235,7 +235,7 @@ def _lists(outputs: Outputs) -> tuple[Floats, Floats, Floats]:
 
 
 def _shares(boxes: Floats) -> bool:
-    """Return whether centres and sizes are fractions of the image, even those of queries that found nothing."""
+    """Return whether centres and sizes are fractions of the image, including those of queries that found nothing."""
     finite = boxes[np.isfinite(boxes).all(axis=1)]
     return bool(len(finite)) and bool(((finite >= -0.5) & (finite <= 1.5)).all())
 
@@ -258,7 +258,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's best class. NaN counts as the best score, so that its row is dropped later."""
+    """Choose each row's best class. NaN counts as the best score, so that its row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)
@@ -321,7 +321,7 @@ _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "te
 
 
 class OnnxDetector:
-    """Runs a YOLO or DETR network, recognised by its outputs, as a detector. Call it from one thread.
+    """Runs a YOLO or DETR network, recognised by its outputs, as a detector. Call it from one thread only.
 
     Attributes:
         layout: Layout of the network's outputs.
@@ -347,8 +347,8 @@ class OnnxDetector:
             path: The ONNX file.
             score: Minimum score of a detection, 0 to 1.
             iou: Merge boxes of one class that overlap by more than this (intersection over union), 0 to 1.
-            names: Class names: a list, a mapping from numbers, or a text file with one per line. None uses those in the
-                file's metadata, as Ultralytics writes them, or the numbers.
+            names: Class names: a list, a mapping from numbers, or a text file with one per line. If None, the names in
+                the file's metadata are used, as written by Ultralytics, or else the numbers.
             threads: CPU threads per image; more than 1 takes CPU time away from other flight code.
             layout: Layout of the outputs, in case it is ambiguous.
             size: Width and height of the input [px], for a network that takes any size.

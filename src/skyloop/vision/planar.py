@@ -117,7 +117,7 @@ _FAMILIES: Final = (
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), which end once a marker is found
+_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), made until a marker is found
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
@@ -129,7 +129,7 @@ class MarkerSighting(PlanarSighting):
 
 
 class MarkerDetector:
-    """Detects markers of one dictionary and one size. Keeps OpenCV's working memory, so use one detector per thread.
+    """Detects markers of one dictionary and one size. A detector keeps OpenCV's working memory, so use one per thread.
 
     Attributes:
         dictionary: The dictionary's name, as given.
@@ -180,7 +180,7 @@ class MarkerDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            intrinsics: Intrinsics of the camera; None uses the frame's own.
+            intrinsics: Intrinsics of the camera; defaults to the frame's own.
 
         Returns:
             The sightings, ordered by id.
@@ -209,7 +209,7 @@ class MarkerDetector:
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
         parameters = self._cv.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0  # keeps a square object in the room from being taken for a tag
+        parameters.errorCorrectionRate = 0.0  # prevents a square object in the room from being mistaken for a tag
         markers = marker_dictionary(self._cv, family)
         _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
         self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
@@ -238,7 +238,7 @@ def _make_detector(cv: Any, dictionary: str) -> Any:
     parameters = cv.aruco.DetectorParameters()
     # Refine corners to a fraction of a pixel, because a marker's range is only as accurate as its edges.
     parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
-    # Half a cell each way puts corners 0.31 px off (median of 150 noisy poses); OpenCV's 0.3 puts them 0.46 px off.
+    # Half a cell each way gives corner errors of 0.31 px (median of 150 noisy poses); OpenCV's 0.3 gives 0.46 px.
     parameters.relativeCornerRefinmentWinSize = 0.5
     # The white card's edge is another square near the marker's; with OpenCV's 0.125 it can hide the marker.
     parameters.minMarkerDistanceRate = 0.05

@@ -1,19 +1,19 @@
 """Trackers that follow a box from image to image by a correlation filter, by the flow of points, or by a network.
 
-**Correlation.** The tracker learns a filter whose correlation with the patch around the target peaks sharply in its
-middle. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
-correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
-(Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
-linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan, Häger, Khan
-and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
+**Correlation.** The tracker learns a filter whose correlation with the patch around the target peaks sharply at the
+patch's centre. The correlation is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object
+tracking using adaptive correlation filters", CVPR 2010), over several channels of gradients and colours and a patch
+larger than the target (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation
+filters", TPAMI 37, 2015; its linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17
+sizes (Danelljan, Häger, Khan and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
 2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half of the points that
-return closest to their start is kept, and of these the half whose surroundings look most alike. Their median
+return closest to their start is kept, and then the half of these whose surroundings changed least. Their median
 displacement gives the motion, and the median change of the distances between them gives the scale.
 
-**Learned.** ViTTrack (``cv2.TrackerVit``) is a single ONNX file. NanoTrack (``cv2.TrackerNano``) is two: the backbone,
-and the neck with the head.
+**Learned.** ViTTrack (``cv2.TrackerVit``) is a single ONNX file. NanoTrack (``cv2.TrackerNano``) consists of two files:
+the backbone, and the neck with the head.
 
 A box is x, y, width and height in pixels: its left and top edge, and its size, as in OpenCV. A box with integer values
 covers columns x to x + width − 1 and rows y to y + height − 1.
@@ -53,7 +53,7 @@ class TrackResult:
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
     score: float  #: similarity to the target, 0 to 1; a score, not a probability
-    confidence: float | None = None  #: probability that the overlap is at least half; None without an estimate
+    confidence: float | None = None  #: probability that the overlap is at least half; None if there is no estimate
 
     @property
     def lost(self) -> bool:
@@ -88,7 +88,7 @@ class Tracker(ABC):
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            box: x, y, width, height [px]. At least half of it must be in the image.
+            box: x, y, width, height [px]. At least half of the box must be in the image.
 
         Raises:
             UsageError: The array has a wrong shape or type, or the box is empty, not finite or outside the image.
@@ -119,10 +119,10 @@ class Tracker(ABC):
         return self._update(pixels)
 
     def shift(self, right: float, down: float) -> None:  # noqa: B027 - subclasses may ignore this
-        """Report how far the camera's rotation has moved the target in the image since the last one [px].
+        """Report how far the camera's rotation has moved the target since the last image [px].
 
         The tracker looks for the target there in the next image. Trackers that search everywhere or measure the image's
-        motion themselves ignore this. Calling it is optional.
+        motion themselves ignore this. Calls to this method are optional.
         """
 
     @abstractmethod
@@ -135,7 +135,7 @@ class Tracker(ABC):
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
-    """Return a tracker's initial box; UsageError if malformed, too small, or less than half in the image."""
+    """Return a tracker's initial box; raise UsageError if malformed, too small, or less than half in the image."""
     try:
         x, y, width, height = (float(part) for part in box)
     except (TypeError, ValueError):
@@ -171,14 +171,14 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box, at least partly in the image, to a size (width, height). Pixels outside repeat the edge."""
+    """Sample a box that is at least partly in the image, at a size (width, height). Pixels outside repeat the edge."""
     x, y, width, height = box
     rows, columns = image.shape[:2]
     left, top = max(0, math.floor(x) - 1), max(0, math.floor(y) - 1)
     right, bottom = min(columns, math.ceil(x + width) + 1), min(rows, math.ceil(y + height) + 1)
     left, top = min(left, columns - 1), min(top, rows - 1)
     part = image[top : max(bottom, top + 1), left : max(right, left + 1)]
-    # Linear sampling uses only the nearest pixels, so average a large area down first.
+    # Linear sampling uses only the nearest pixels, so shrink a large area by averaging first.
     coarse = [max(1, int(full / wanted)) for full, wanted in zip((width, height), size, strict=True)]
     high, wide = part.shape[:2]
     if max(coarse) > 1:
@@ -196,8 +196,8 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
 def features(cv: Any, pixels: Image) -> Floats:
     """Return a patch's features, (channels, height / CELL, width / CELL): 8 channels for grey, 10 for colour.
 
-    Each cell has its gradient strength and the first harmonics of the gradient's direction, which carry the information
-    of a direction histogram in fewer numbers. Both are normalised by the local strength, so light and contrast don't
+    Each cell has its gradient strength and the first harmonics of the gradient's direction, which hold the information
+    of a direction histogram in fewer numbers. Both are normalised by the local strength, so lighting and contrast don't
     matter. The other channels are brightness and, for a colour image, both colour components relative to the patch's.
     """
     size = (pixels.shape[1] // CELL, pixels.shape[0] // CELL)
@@ -258,7 +258,7 @@ class _Filter:
         self._below: Floats | None = None
 
     def learn(self, spectrum: Spectrum) -> None:
-        """Learn from a patch's spectrum (channels first): the first replaces the filter, later ones are blended in."""
+        """Learn from a patch's spectrum (channels first): the first replaces the filter; later ones are mixed in."""
         above = np.conj(self._wanted) * spectrum
         below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
         if self._above is None or self._below is None:
@@ -276,7 +276,7 @@ class _Filter:
 
 
 class CorrelationTracker(Tracker):
-    """Tracks a target's position and size with correlation filters. Fast, and the default.
+    """Tracks a target's position and size with correlation filters. This tracker is fast, and it is the default.
 
     It follows a target that changes slowly and moves by less than half its size between images. The score is the height
     of the correlation peak: about 1 for the image that it was learned from. Below ``lost_below`` the target counts as
@@ -378,7 +378,7 @@ class CorrelationTracker(Tracker):
 
 
 def _in_cells(size: NDArray[np.float64], area_px: float) -> tuple[int, int]:
-    """Return a width and height in whole cells, both even, with about this area and the proportions of a size."""
+    """Return a size in whole cells, both numbers even, with about this area and the same aspect ratio as ``size``."""
     share = math.sqrt(area_px / float(size[0] * size[1]))
     width, height = (max(2, round(float(side) * share / CELL / 2) * 2) * CELL for side in size)
     return width, height
@@ -405,8 +405,8 @@ class MedianFlowTracker(Tracker):
     """Tracks a target's position and size from each image to the next, without remembering the target's appearance.
 
     It is accurate while the target is in view and moves smoothly. It notices a failure at once and then stays lost
-    until restarted. It drifts because it never compares with the first image. The score expresses how many points
-    returned and how closely.
+    until restarted. It drifts because it never compares an image with the first one. The score expresses how many
+    points returned to where they started, and how closely.
     """
 
     def __init__(self) -> None:
@@ -463,7 +463,7 @@ class MedianFlowTracker(Tracker):
         return found, min(score, 1.0)
 
     def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return the points' new positions, how far off each is after tracking back, and which were tracked."""
+        """Return the points' new positions, their errors after tracking back, and which of the points were tracked."""
         cv = self._cv
         points = before.reshape(-1, 1, 2)
         after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
@@ -491,7 +491,7 @@ def _grid(box: Box) -> Floats:
 
 
 def _stretch(before: Floats, after: Floats) -> float:
-    """Return by how much the distances between the points grew: the median over all pairs."""
+    """Return the factor by which the distances between the points grew: the median over all pairs."""
     one, other = np.triu_indices(len(before), k=1)
     old = np.linalg.norm(before[one] - before[other], axis=1)
     new = np.linalg.norm(after[one] - after[other], axis=1)
@@ -499,7 +499,7 @@ def _stretch(before: Floats, after: Floats) -> float:
 
 
 class LearnedTracker(Tracker):
-    """Tracks by a neural network that OpenCV runs on the CPU. The score is the one returned by the network.
+    """Tracks by a neural network that OpenCV runs on the CPU. The score comes from the network.
 
     Skyloop doesn't include the weights: the OpenCV Zoo offers object_tracking_vittrack_2023sep.onnx, and NanoTrack's
     repository has its two files.
@@ -549,7 +549,7 @@ class LearnedTracker(Tracker):
         return TrackResult(None if lost else (x, y, width, height), score)
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        """Call OpenCV's tracker. A file with a different network often loads and only fails here."""
+        """Call OpenCV's tracker. A file with a different network often loads without an error and fails only here."""
         try:
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:
