@@ -1,6 +1,6 @@
 """Encode messages in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, text.
 
-Pure. Needs the extra ``record``. Times are in Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
+Pure. Needs the extra ``record``. Times are in Unix ns; frame names are those of :mod:`skyloop.recording.layout`.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ __all__ = [
     "PosesInFrame",
 ]
 
-LINE_WIDTH: Final = 2.0  # width in pixels
+LINE_WIDTH: Final = 2.0  # line width in pixels
 FONT_SIZE: Final = 14.0
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 
 
 def schema(message: type[Message]) -> bytes:
-    """Return the file descriptor set of a message with all its dependencies, as MCAP requires."""
+    """Return the file descriptor set of a message, including all its dependencies, as MCAP requires."""
     found = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -142,7 +142,7 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_of(values: Sequence[float]) -> Pose:
-    """Build a pose from a position [m] and a quaternion, given as x, y, z, qx, qy, qz, qw."""
+    """Build a pose from a position [m] and a quaternion, in the order x, y, z, qx, qy, qz, qw."""
     x, y, z, qx, qy, qz, qw = values[:7]
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 

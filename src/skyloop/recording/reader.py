@@ -1,4 +1,4 @@
-"""Read a recording: its drones, and their samples in order of reception; describe the files in a folder."""
+"""Read a recording: its drones, and their samples in order of reception; describe the recordings in a folder."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Entry:
     """One message in the file; times are Unix time [ns]."""
 
     topic: str
-    log_ns: int  #: when it was received
-    publish_ns: int  #: when it was captured
+    log_ns: int  #: time at which it was received
+    publish_ns: int  #: time at which it was captured
     sequence: int
     data: bytes
 
@@ -55,15 +55,15 @@ class Series:
 
     topic: str
     schema: str
-    own: Topic | None  #: None for viewers' topics and for those of other programs
+    own: Topic | None  #: None for topics of viewers and of other programs
 
 
 @dataclass(slots=True)
 class Recording:
     """An MCAP file recorded by Skyloop. Opening it reads the index or, if there is none, scans the file.
 
-    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is.
-    Unreadable parts in the middle are skipped and listed in :attr:`damaged`.
+    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where it is
+    truncated. Unreadable parts in the middle are skipped and listed in :attr:`damaged`.
     """
 
     path: Path
@@ -103,7 +103,7 @@ class Recording:
 
     @property
     def cut(self) -> str:
-        """Why the file is incomplete; empty if it is complete."""
+        """The reason why the file is incomplete; empty if it is complete."""
         return self.found.cut
 
     @property
@@ -113,7 +113,7 @@ class Recording:
 
     @property
     def drones(self) -> tuple[DroneRecord, ...]:
-        """The drones of the recording."""
+        """The drones in the recording."""
         return self.start.drones
 
     def drone(self, name: str | None = None) -> DroneRecord:
@@ -172,7 +172,7 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """Time from the first message to the last."""
+        """Time between the first and last messages."""
         first, last = self.span_ns
         return (last - first) / NS_PER_S
 
@@ -181,11 +181,11 @@ class Recording:
     def entries(
         self, topics: Collection[str] | None = None, *, from_ns: int = 0, progress: Progress | None = None
     ) -> Iterator[Entry]:
-        """Yield messages in the order of their log time.
+        """Yield messages in order of their log time.
 
         Args:
-            topics: Topics to yield; None yields all.
-            from_ns: Log time to start from, Unix time [ns].
+            topics: Topics to yield, or None to yield all topics.
+            from_ns: Log time at which to start, Unix time [ns].
             progress: Called with the fraction read so far, 0 to 1.
 
         Raises:
@@ -195,7 +195,7 @@ class Recording:
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with scan.open_file(self.path) as file:
-            # Several threads feed a recorder, so a slightly older message can come later, even in the next piece.
+            # Several threads feed a recorder, so a slightly older message may appear later, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
@@ -203,7 +203,7 @@ class Recording:
                     held += (entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns)
                     held.sort(key=attrgetter("log_ns"))
                     until = len(held)
-                    if after is not None and after.start_ns > 0:  # otherwise the time of its first message is unknown
+                    if after is not None and after.start_ns > 0:  # otherwise the time of the first message is unknown
                         until = bisect_left(held, after.start_ns, key=attrgetter("log_ns"))
                     yield from held[:until]
                     held = held[until:]
@@ -291,7 +291,7 @@ class Recording:
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
     ) -> Iterator[Item | Picture]:
-        """Yield the samples of some topics, with frames as pictures instead of records."""
+        """Yield the samples of the given topics, with frames as pictures instead of records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
             topic = topics.get(entry.topic)
@@ -316,7 +316,7 @@ class Recording:
         }
 
 
-_Kind = tuple[str, bool]  # camera, and whether the image is the vehicle's own H.264
+_Kind = tuple[str, bool]  # camera name, and whether the image is the vehicle's own H.264
 
 
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
@@ -367,14 +367,14 @@ def _foreign(found: Scan) -> str:
 class Described(msgspec.Struct, frozen=True):
     """A summary of a recording."""
 
-    started: float | None = None  #: Unix time [s]; None if unknown
+    started: float | None = None  #: Unix time [s], or None if unknown
     drones: tuple[str, ...] = ()
     seconds: float | None = None  #: time from the first message to the last
     problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
 
 
 def shown_name(path: Path) -> str:
-    """Return a file's name as text, with non-UTF-8 bytes in hexadecimal."""
+    """Return a file's name as text, with bytes that are not UTF-8 in hexadecimal."""
     return os.fsencode(path.name).decode(errors="backslashreplace")
 
 
