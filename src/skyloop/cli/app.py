@@ -42,7 +42,7 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line. Only the modules of the given commands are imported now, all others on demand."""
+    """Return the command line. Only the modules of the given commands are imported now; others, on demand."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,

@@ -357,7 +357,7 @@ def preflight(
 ) -> None:
     """Check a drone before a flight: its link, battery, position, zones, video and built-in failsafes. Flies nothing.
 
-    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. The exit code is 1 with any ✗.
+    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. Exit code 1 with any ✗ mark.
     """
     from contextlib import suppress
 

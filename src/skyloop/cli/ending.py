@@ -113,7 +113,7 @@ def stop(
 ) -> None:
     """Emergency stop: cut the motors immediately. The drones FALL.
 
-    It works no matter who is flying and asks first, except with --yes. Exit code 1 if a drone did not confirm.
+    It works no matter who is flying. It asks first, except with --yes. Exit code 1 if a drone did not confirm.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:

@@ -412,7 +412,7 @@ def fly_follow(
 
     Give --class, --box, or both. The drone does not see walls and trees: fly it where there are none.
 
-    A line each second on standard error shows the progress. Ctrl-C lands. Exit code 1 if the target was lost for good.
+    Standard error shows a progress line each second. Ctrl-C lands. Exit code 1 if the target is lost for good.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority

@@ -101,7 +101,7 @@ def places(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return a factory for a proxy's transport server, for this host, optionally a group, and the network if set."""
+    """Return a factory for a proxy's transport server: on this host, optionally in a group and on the network."""
     from skyloop.transport.local import LocalServer
 
     if settings is None:
@@ -244,7 +244,7 @@ def init(
     directory: LabOption = None,
     days: Annotated[int, typer.Option(metavar="N", help="Validity of the authority, and so of the lab")] = 1825,
 ) -> None:
-    """Create a lab's certificate authority. Its folder lets anyone issue keys: keep it on one machine, backed up."""
+    """Create a lab's certificate authority. Its folder can issue keys for anyone: keep it on one machine, backed up."""
     from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)

@@ -106,7 +106,7 @@ def sim(
     """Simulate drones that see one another in one world until Ctrl-C; each has its own proxy.
 
     With --autopilot, the drones are flown by real ArduCopter, PX4 or Betaflight (docs/autopilots.md). With --firmware,
-    each is instead an emulation of a drone's firmware on the network, for any program that can fly the real one.
+    each is instead an emulation of a real drone's firmware on the network, for any program that can fly it.
 
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
@@ -335,7 +335,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
+    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's.
 
     Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
     """
@@ -348,7 +348,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return an AR.Drone's ports, starting at ``base`` and 10 higher for each further drone; any free ones if it is 0.
+    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports.
 
     Raise ``UsageError`` if a port is out of range.
     """

@@ -78,7 +78,7 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
 
 
 def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
-    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is missing or unowned."""
+    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is missing or has none."""
     wanted = {(_table_entry(client, mapped), _table_entry(server, mapped)) for mapped in (False, True)}
     for line in table.splitlines()[1:]:
         cells = line.split()
@@ -112,7 +112,7 @@ class Person:
         return self.role is Role.PILOT or role is Role.OBSERVER
 
     def display_name(self, requested: str) -> str:
-        """Return the name shown to others; ``requested`` is used only if the person's token or certificate has none."""
+        """Return the name shown to others; ``requested`` is used only if the token or certificate contains no name."""
         return self.name or " ".join("".join(filter(str.isprintable, requested)).split())[:MAX_NAME]
 
 
@@ -389,7 +389,7 @@ class WrongTokens:
     def __init__(self, clock: Clock = monotonic_ns) -> None:
         self.count = 0  #: number of wrong tokens since startup
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # wrong tokens and time of the last; quietest first
+        self._of_address: dict[str, tuple[int, int]] = {}  # count and time of the last wrong token; quietest first
         self._minute_ns = clock()
         self._in_minute = 0
 
@@ -445,7 +445,7 @@ class SessionFile:
         self._boot = boot_id() if boot is None else boot
 
     def load(self) -> list[Session]:
-        """Return the sessions; none if the file is missing, damaged, another user's or from before a reboot."""
+        """Return the sessions; none if the file is missing, damaged, owned by others or from before a reboot."""
         try:
             descriptor = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             with os.fdopen(descriptor, "rb") as file:

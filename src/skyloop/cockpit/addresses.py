@@ -145,11 +145,11 @@ def qr_code(text: str) -> str:
 
 
 class Announcer:
-    """Prints the page's address, with a QR code for phones if others can reach the page and the terminal can show one.
+    """Prints the page's address, with a QR code if other machines can reach the page and the terminal can show one.
 
-    With pairing, the address in the QR code contains the pairing code after the ``#``, in the part that browsers never
-    send. The next code is printed as soon as the last one has been used or has expired. ``pairing``: issues the codes,
-    or None if everyone is admitted or people have tokens. ``loopback``: whether only this machine can reach the page.
+    With pairing, the address in the QR code contains the code after the ``#``, in the part that browsers never send.
+    The next code is printed as soon as the last one has been used or has expired. ``pairing``: issues the codes, or
+    None if everyone is admitted or people have tokens. ``loopback``: whether only this machine can reach the page.
     """
 
     def __init__(self, pairing: Pairing | None, loopback: bool) -> None:

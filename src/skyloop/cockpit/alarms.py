@@ -36,7 +36,7 @@ class Alarm(msgspec.Struct, frozen=True):
     """A problem that currently exists.
 
     Args:
-        id: The subject of the alarm. It stays the same while the alarm lasts, so a page can remember acknowledgements.
+        id: The subject of the alarm. It is constant while the alarm lasts, so a page can remember acknowledgements.
         severity: Its level may rise while the alarm lasts, for example when a degraded link is lost.
         text: A description that includes the current value.
     """

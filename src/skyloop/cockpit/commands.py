@@ -225,7 +225,7 @@ def late_s(command: Command) -> float:
 class HandWatch:
     """Determines whether a person's hand is holding the deflected sticks. Pure.
 
-    Hands are never still: a finger moves by pixels, a held key repeats, an axis at its limit jitters. The values from a
+    Hands are never still: fingers move by pixels, held keys repeat, and axes at their limits jitter. The values from a
     gamepad that has lost its radio link stay constant; so do those from a page that has lost track of held keys.
     """
 
@@ -235,7 +235,7 @@ class HandWatch:
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Handle a stick command; return whether there has been a sign of a hand within :data:`UNTOUCHED_S`."""
+        """Handle a stick command; return whether there was a sign of a hand within :data:`UNTOUCHED_S`."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")

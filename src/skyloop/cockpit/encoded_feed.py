@@ -42,7 +42,7 @@ def _give_way() -> None:
 
 
 #: One thread for all cameras, because encoding for many pages must not take CPU cores away from flying. The event loop
-#: keeps its original priority: a person's sticks and stop pass through it, and a browser must not starve it.
+#: keeps its original priority: stick and stop commands pass through it, and a browser must not starve it.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
 KEPT: Final = 16  #: number of pictures kept per stream; a page further behind resumes at a key frame
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: only a few scales, so that similar panes share a stream
@@ -86,7 +86,7 @@ class CameraFeed:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame. The first subscriber subscribes to the camera."""
+        """Call ``wake`` on the loop for each newer frame. The first subscriber starts the camera's subscription."""
         self._wakes.add(wake)
         if self._listener is None:
             loop = asyncio.get_running_loop()

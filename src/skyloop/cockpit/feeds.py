@@ -76,7 +76,7 @@ class PeriodicBroadcast:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and immediately for a fresh one, unless the broadcast is closed."""
+        """Call ``wake`` for each new message, and at once if one is already fresh, unless the broadcast is closed."""
         if self.closed:
             wake()
             return

@@ -45,7 +45,7 @@ Json = dict[str, Any]
 
 
 class FollowerFactory(Protocol):
-    """Creates a follower for one target; called like :class:`skyloop.control.target_follower.TargetFollower`."""
+    """Creates a follower for one target, like :class:`skyloop.control.target_follower.TargetFollower`."""
 
     def __call__(
         self,

@@ -120,7 +120,7 @@ class Admission:
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
         """Record that a complete request has arrived.
 
-        ``person``: who sent it; None for a stranger. Return why the request is refused; empty if it is not.
+        ``person``: who sent it; None for a stranger. Return why the request is refused, or "" if it is accepted.
         """
         if person is None:
             connection.asked = True
@@ -322,7 +322,7 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # time and number dropped since, by message without values
+        self._logged: dict[str, tuple[int, int]] = {}  # time, and repeats dropped since, by message without values
 
     def filter(self, record: logging.LogRecord) -> bool:
         key, now_ns = f"{record.name} {record.msg}", self._clock()

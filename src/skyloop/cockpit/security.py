@@ -6,7 +6,7 @@ every WebSocket and every request that changes something, and pages can't forge 
 ``Sec-Fetch-Site`` reveals where it comes from: a link from another site may lead only to the page itself. Finally, the
 page may load only its own files and can't be framed (Content-Security-Policy).
 
-After these checks the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
+After these checks, the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
 needs: observer by default, or pilot for routes that change something.
 """
 

@@ -1,6 +1,6 @@
 """Send data to pages, with one object per open socket. A page that can't keep up gets less data, but never older data.
 
-Video: only one JPEG is in flight at a time; the page gets the newest one after it has drawn and acknowledged the last.
+Video: only one JPEG is in flight at a time; the page gets the newest after it has drawn and acknowledged the previous.
 Several H.264 pictures may be in flight, because they depend on each other; after a gap, a page needs a key frame.
 Telemetry: the newest state about 20 times a second, or as fast as the socket accepts it, created once for all pages.
 """
@@ -75,7 +75,7 @@ class PagePath:
         self._under_way.append((number, size, now_ns))
 
     def acknowledged(self, number: int, now_ns: int) -> int:
-        """Record that the page has a picture and all earlier ones; return how many of them were new."""
+        """Record that the page has received a picture and all earlier ones; return how many are newly received."""
         count = 0
         while self._under_way and self._under_way[0][0] <= number:
             self._trip_s = seconds(now_ns - self._under_way.popleft()[2])

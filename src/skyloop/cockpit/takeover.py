@@ -96,7 +96,7 @@ class QueuePosition:
     position: int | None  #: 1 if the page is next; None if unknown
     until_ns: int | None  #: time at which its turn is expected; None if unknown
     asked: bool  #: whether the person in control was asked first
-    declined: str | None  #: the holder's reason for keeping it, which may be empty; None if it did not decline
+    declined: str | None  #: holder's reason for keeping control, which may be empty; None if it did not decline
 
     def to_json(self, now_ns: int) -> Json:
         """Return the position as JSON values; ``now_ns`` is on the monotonic clock."""

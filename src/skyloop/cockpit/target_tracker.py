@@ -1,4 +1,4 @@
-"""Keep frames while a person draws a box, and track its content from that frame on, on separate threads.
+"""Keep frames while a person draws a box, and track the box's content from that frame on; each uses its own thread.
 
 Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is called
 on one other thread only. It first catches up frame by frame, and then always processes the newest frame. A set-point is
@@ -150,7 +150,7 @@ class FrameKeeper:
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # keep no reference: the frame's memory belongs to the proxy
+            frame, self._newest = self._newest, None  # keep no reference, as the frame's memory belongs to the proxy
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:

@@ -125,7 +125,7 @@ def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
 def pose(feedback: Feedback) -> Pose | None:
     """Return the vehicle's pose in world axes, or None while its attitude is unknown.
 
-    If the position is unknown, place it above the origin at its altitude, so that at least attitude and height show.
+    If the position is unknown, place the drone above the origin, so that at least its attitude and height are visible.
     """
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None

@@ -189,7 +189,7 @@ class FoxgloveServer:
             topic.name, schema=described, message_encoding=schema.message_encoding, context=self._context
         )
 
-    # On the SDK's threads, as it calls its listener; it only logs exceptions raised here ------------------------------
+    # On the SDK's threads, which call the listener; the SDK only logs exceptions raised here --------------------------
 
     def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
         """Register a viewer's subscription."""

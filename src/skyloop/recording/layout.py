@@ -76,7 +76,7 @@ class ClockPair(msgspec.Struct, frozen=True):
         return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is that monotonic clock minus the recorder's.
+        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is that time's clock minus the recorder's.
 
         The result is clamped to the range that a file can hold, so that a sample with an absurd time can't corrupt it.
         """

@@ -38,7 +38,7 @@ class Picture:
     log_ns: int  #: time at which it was received, Unix time [ns]
     publish_ns: int  #: when it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: the frame's group and its index there, if it is decodable H.264
+    group: tuple[Group, int] | None = None  #: the frame's group and its index in it, for decodable H.264
 
     @property
     def header(self) -> FrameHeader:

@@ -1,4 +1,4 @@
-"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, without MCAP.
+"""Convert Skyloop's own samples to JSON objects with a schema and back, and read their times. Pure; does not use MCAP.
 
 The keys are the field names of the sample's class. Unknown values are absent, numbers that are not finite are null, and
 an extra key (``action``, ``shape``) distinguishes the members of a union.
@@ -294,7 +294,7 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 
 # Times ----------------------------------------------------------------------------------------------------------
 #
-# A sample's timestamp is when the proxy received it, on the proxy's clock: the time axis of a flight. The file's own
+# A sample's timestamp is its time of reception on the proxy's clock: the time axis of a flight. The file's own
 # timestamps are on the recorder's clock, which is unrelated to the flight if a replay runs in step with an application.
 
 
@@ -334,7 +334,7 @@ def shifted(value: Any, shift_ns: int) -> Any:
 
 
 class Course:
-    """Tracks the time along a recording, sample by sample: it never runs backwards and ignores a single wrong time.
+    """Tracks the time along a recording, sample by sample. It never runs backwards, and a single wrong time is ignored.
 
     If the proxy's clock restarts because its computer was rebooted, time continues from the last value, advanced by the
     time that elapsed on the recorder's clock.

@@ -91,7 +91,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer is already listening there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -313,7 +313,7 @@ class RerunLog:
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
         """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
-        ``recording``: name of the recording; Rerun merges recordings that have the same name. If empty, one is made up.
+        ``recording``: name of the recording; Rerun merges recordings that have the same name. If empty, one is created.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))

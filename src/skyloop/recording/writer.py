@@ -1,4 +1,4 @@
-"""The writing thread and its files: takes samples from the backlog, translates and writes them, watches the disk."""
+"""The writing thread and its files: take samples from the backlog, translate and write them, and watch the disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CHUNK: Final = MB  #: a chunk is closed at this size, or earlier by :meth:`Recor
 BEAT_S: Final = 0.05  #: interval between polls of the backlog, so that receiving threads need not wake the writer
 _COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
 _REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that had been full
-#: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
+#: How long to keep writing to a full file until a key frame arrives: cameras not on drones send one about every 10 s.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
 _SILENCE_NS: Final = nanoseconds(2.0)  #: after this time without H.264, a full file does not wait for a key frame
 _LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk space, and between attempts to resume writing

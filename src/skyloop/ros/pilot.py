@@ -119,7 +119,7 @@ class Pilot:
         self._unless_occupied("goal_pose", fly)
 
     def _unless_occupied(self, topic: str, send: Callable[[], object]) -> None:
-        """Send a set-point, unless a service is running: programs keep publishing while they wait for one.
+        """Send a set-point unless a service is running, because programs keep publishing while they wait for a service.
 
         A service takes the same lock before it begins; otherwise a velocity that was checked before a landing could be
         sent after it. ``send`` must not block.
@@ -168,7 +168,7 @@ class Pilot:
                 raise UsageError("the goal's height is 0 and the drone's own is unknown: give z")
             found["z"] = position[2]
         angles = euler_of((turn.x, turn.y, turn.z, turn.w))
-        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # the default of a new message
+        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # default of a new message
         if angles is not None and not as_made:
             found["yaw"] = angles[2]
         return found

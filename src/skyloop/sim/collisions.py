@@ -69,7 +69,7 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits of centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
@@ -318,7 +318,7 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one might leave the broad phase's reach in the remaining time."""
+        """Separate two drones; return whether one might leave the broad phase's reach in the time left."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()

@@ -87,7 +87,7 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def put(self, drone: int) -> None:
-        """Replace the estimate of a drone that was moved and is at rest: the old one is for another position."""
+        """Replace a drone's estimate after it was moved and put at rest: the old one is for another position."""
         height = self._bodies.position[2, drone] - self._half_height[drone]
         self._estimate[:, drone] = self._bias[9:, drone]
         self._estimate[0, drone] += height

@@ -114,7 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Return the clock time at which the simulation reached, or will reach, a time since this pacer's start."""
+        """Return the clock time at which the simulation reached, or will reach, a time since the pacer's start."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:

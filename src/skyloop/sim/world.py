@@ -186,7 +186,7 @@ class MarkerPattern:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker with a fixed pose: that of its centre. The top of the marker is the top of the picture."""
+    """A printed marker with a fixed pose: the pose of its centre. The top of the marker is the top of the picture."""
 
     name: str
     pose: FacePose

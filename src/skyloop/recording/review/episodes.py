@@ -228,7 +228,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """An H.264 MP4 file with one camera's images from all episodes at a fixed rate. An error removes it."""
+    """An H.264 MP4 file with one camera's images from all episodes at a fixed rate. It is deleted after an error."""
 
     def __init__(self, path: Path, fps: float) -> None:
         #: number of rows that repeat the previous image because their own image could not be decoded

@@ -98,7 +98,7 @@ class _Builder:
 
 
 def _array(cells: list[Cell]) -> NDArray[Any]:
-    """Convert cells to integers if they all are, to floats if they are all numbers, otherwise to strings."""
+    """Convert cells to integers if all of them are, to floats if all are numbers, and otherwise to strings."""
     kinds = {type(cell) for cell in cells}
     if kinds <= {int}:
         return np.array(cells, np.int64)

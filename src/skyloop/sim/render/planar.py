@@ -189,7 +189,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # The scene moves to the left if the camera rotates about y (down), down if about x (right). Roll is ignored.
+        # The scene moves left if the camera rotates about y (down), and down if about x (right). Roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
