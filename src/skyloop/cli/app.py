@@ -115,7 +115,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
-    except ImportError as error:  # a package is missing that no module of Skyloop checks for
+    except ImportError as error:  # a package is missing, but no module of Skyloop checks for it
         from skyloop.cli.install import missing
 
         entry = entry_of(arguments)

@@ -357,7 +357,7 @@ def preflight(
 ) -> None:
     """Check a drone before a flight: its link, battery, position, zones, video and built-in failsafes. Flies nothing.
 
-    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. Exit code 1 with any ✗ mark.
+    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. Exit code 1 if there is any ✗.
     """
     from contextlib import suppress
 

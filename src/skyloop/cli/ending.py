@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover permanently, so that no further return is attempted."""
+    """Hover permanently, so that the return is not attempted again."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 

@@ -269,7 +269,7 @@ def what_failed(error: Exception) -> str:
 
 
 def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
-    """Return the innermost line outside Skyloop and libraries, or, if there is none, the innermost outside Skyloop."""
+    """Return the innermost line outside Skyloop and libraries or, if there is none, the innermost outside Skyloop."""
     theirs = [line for line in stack if not line.filename.startswith(home)]
     libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
     return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])
@@ -412,7 +412,7 @@ def fly_follow(
 
     Give --class, --box, or both. The drone does not see walls and trees: fly it where there are none.
 
-    Standard error shows a progress line each second. Ctrl-C lands. Exit code 1 if the target is lost for good.
+    Progress is printed on standard error each second. Ctrl-C lands. Exit code 1 if the target is lost for good.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority

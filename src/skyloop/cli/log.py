@@ -153,7 +153,7 @@ def export(
 ) -> None:
     """Write the samples as tables, a camera's frames as a video, flights as training data, or all of it for Rerun.
 
-    H.264 is copied as recorded, which takes seconds, unless the time is drawn on the frames. For lerobot, flights
+    H.264 is copied as recorded, which takes only seconds, unless the time is drawn on the frames. For lerobot, flights
     become episodes of a LeRobotDataset: pictures, the state at the capture of each picture, and the commands. rrd is a
     file for Rerun's viewer that contains all drones. Foxglove and Lichtblick can open the recording directly.
     """
@@ -247,7 +247,7 @@ def recover(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Write the readable part of a cut or damaged recording to a new file with an index. The original file is kept."""
+    """Write the readable part of a damaged recording to a new file with an index. The original file is kept."""
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)

@@ -162,7 +162,7 @@ def join_network(network: str | None, keys: Path | None) -> None:
         return
     from skyloop.network.config import choose
 
-    choose(network, keys)  # raises if values are invalid
+    choose(network, keys)  # raises an error if values are invalid
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
         if value is not None:
             os.environ[variable] = str(value)

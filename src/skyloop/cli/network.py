@@ -178,7 +178,7 @@ def router(
         typer.Option("--print-config", help="Only print the configuration, for Zenoh's own router: zenohd -c FILE"),
     ] = False,
 ) -> None:
-    """Relay between proxies and applications on several networks until Ctrl-C.
+    """Relay between proxies and applications on several networks until Ctrl-C is pressed.
 
     Each proxy and application connects to a router that it can reach; routers connect to one another.
     """
@@ -244,7 +244,7 @@ def init(
     directory: LabOption = None,
     days: Annotated[int, typer.Option(metavar="N", help="Validity of the authority, and so of the lab")] = 1825,
 ) -> None:
-    """Create a lab's certificate authority. Its folder can issue keys for anyone: keep it on one machine, backed up."""
+    """Create a lab's certificate authority. Its folder lets anyone issue keys: keep it on one machine, backed up."""
     from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)

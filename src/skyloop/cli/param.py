@@ -143,7 +143,7 @@ def allowed(parameter: Parameter) -> str:
 
 
 def show(value: Value) -> str:
-    """Return a value the way a person would type it."""
+    """Return a value as a person would type it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

@@ -219,7 +219,7 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # the normal way to stop
+    with contextlib.suppress(KeyboardInterrupt):  # this is the normal way to stop
         work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
@@ -235,7 +235,7 @@ class DetectionProcessor:
         self._classes = frozenset(classes)
 
     def process(self, frame: Frame) -> Output:
-        """Detect in one frame."""
+        """Detect objects in one frame."""
         found = [one for one in self._detector.detect(frame) if not self._classes or one.class_name in self._classes]
         found = found[:MOST]
         return Output({"detections": [_value(one) for one in found]}, [s for one in found for s in _shapes(one)])

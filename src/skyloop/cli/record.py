@@ -162,7 +162,7 @@ def view(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones live in Foxglove or Rerun until Ctrl-C. This only observes: others may fly meanwhile.
+    """Show drones live in Foxglove or Rerun until Ctrl-C is pressed. This only observes: others may fly meanwhile.
 
     Connect Foxglove to the printed address. A slow or stalled viewer does not slow down anything else.
     """
@@ -170,7 +170,7 @@ def view(
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to stop
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # this is the normal way to stop
         from skyloop.client import connect as connect_to
         from skyloop.recording.taps import View, give_way
 

@@ -63,11 +63,11 @@ def watch(
             else:
                 _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
-            pass  # the normal way to stop
+            pass  # this is the normal way to stop
 
 
 def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
-    """Print a line every second, with absolute deadlines; the first one immediately."""
+    """Print a line every second, with absolute deadlines; the first line is printed immediately."""
     due = time.monotonic()
     end = due + duration_s
 
@@ -128,7 +128,7 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """Return the whole display."""
+    """Return the complete display."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 

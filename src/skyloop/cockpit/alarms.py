@@ -36,7 +36,7 @@ class Alarm(msgspec.Struct, frozen=True):
     """A problem that currently exists.
 
     Args:
-        id: The subject of the alarm. It is constant while the alarm lasts, so a page can remember acknowledgements.
+        id: The subject of the alarm. It is constant while the alarm lasts, so a page can remember the acknowledgement.
         severity: Its level may rise while the alarm lasts, for example when a degraded link is lost.
         text: A description that includes the current value.
     """
@@ -214,4 +214,4 @@ def _number(config: Config | Mapping[str, Value], name: str, field: str) -> floa
     except UnknownNameError:
         return usual
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if is_number else usual  # type: ignore[arg-type]  # a number, as just checked
+    return float(value) if is_number else usual  # type: ignore[arg-type] # a number, as was just checked

@@ -240,7 +240,7 @@ class HandWatch:
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
         )
-        if not same or sticks.touches is None:  # a pause is no sign of a hand: networks cause pauses, too
+        if not same or sticks.touches is None:  # a pause is no sign of a hand; networks cause pauses, too
             self._moved_s = now_s
         return now_s - self._moved_s <= UNTOUCHED_S
 

@@ -211,7 +211,7 @@ class ControlSession:
             sent = act(pilot)
         if not sent:
             with suppress(SkyloopError):
-                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
+                pilot.idle()  # otherwise it would still be executed if the link were restored soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
 
     @contextmanager
@@ -252,7 +252,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     async def _fly_route(self, command: commands.FlyRoute, held: Callable[[], PilotConnection]) -> None:
-        """Check a route again, because many things may have changed, and fly it."""
+        """Check a route again, because the situation may have changed, and fly it."""
         route = self._station.routes.get(command.id)
         held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
@@ -436,7 +436,7 @@ class ControlSession:
 
     @property
     def _is_under_way(self) -> bool:
-        """Whether this page is flying the vehicle: with sticks, to a waypoint, along a route or behind a target."""
+        """Whether this page is flying the vehicle: with sticks, to a waypoint, along a route or after a target."""
         route = self._route is not None and self._route.is_under_way
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 

@@ -1,4 +1,4 @@
-"""Find the proxies on this host and on the network, without the proxies noticing it."""
+"""Find the proxies on this host and on the network, without being noticed by them."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class CameraFeed:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame. The first subscriber starts the camera's subscription."""
+        """Call ``wake`` on the loop for each newer frame. The first subscriber opens the camera's subscription."""
         self._wakes.add(wake)
         if self._listener is None:
             loop = asyncio.get_running_loop()
@@ -268,8 +268,8 @@ class Form:
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
     """Return the encoding that all panes of about the same size share.
 
-    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum number of pictures per second,
-    None for no limit.
+    ``width``: width of the pane [device pixels], or 0 for full size. ``max_fps``: maximum number of pictures per
+    second, None for no limit.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -334,7 +334,7 @@ class EncodedFeed:
         """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key frame.
 
         ``wake``: called on the event loop for each picture, or None if the page polls. Raise ``SkyloopError`` if the
-        drone was closed, or no longer has this camera.
+        drone was closed or no longer has this camera.
         """
         if self._channel is None:
             form = self.form

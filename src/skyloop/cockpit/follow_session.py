@@ -62,7 +62,7 @@ class FollowSession:
     """Tracks one target at a time for a page and follows it. Used on the event loop.
 
     ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; it is
-    called before the first set-point. ``make``: creates followers; called on a thread.
+    called before the first set-point. ``make``: creates followers; called on a worker thread.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class FollowSession:
         box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
         pilot = None if command.mode is None else held()
         self.end("another target was marked")
-        self._keeper = None  # owned by the tracker from now on
+        self._keeper = None  # from now on, the tracker owns the frame keeper
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
         self._distance_m = settings.distance_m
         settings = settings.within(self._limits)
@@ -262,7 +262,7 @@ class FollowSession:
                     pilot.let_go(self._waits)
                 return
             if not pilot.command(action):
-                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
+                pilot.idle()  # otherwise it would still be executed if the link were restored soon
                 raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
             self._action = action
         except AuthorityError:

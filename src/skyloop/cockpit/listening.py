@@ -104,7 +104,7 @@ class Admission:
         return len(self._known)
 
     def opened(self, connection: Connection, now_ns: int) -> None:
-        """Add a new connection. If it takes the place of another one, close that connection."""
+        """Add a new connection. If it replaces another connection, close the old one."""
         if len(self._anonymous.get(connection.address, ())) >= self.places.anonymous_of_address:
             self._displace(connection.address)
         elif self.anonymous >= self.places.anonymous:

@@ -194,7 +194,7 @@ class Recordings:
     def mark(self, number: str, text: str) -> tuple[str, ...]:
         """Check a mark for a running recording and return the drones to which it applies.
 
-        Raise ``UnknownNameError`` if no such recording is running, or ``UsageError`` if the text is too long.
+        Raise ``UnknownNameError`` if no such recording is running, and ``UsageError`` if the text is too long.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -350,7 +350,7 @@ def _check_number(what: str, end: str, running: int) -> None:
 
 REPORT: Final = "report"
 TIMELINE: Final = "timeline"
-REPORT_S: Final = 120.0  #: time limit for one report
+REPORT_S: Final = 120.0  #: time limit for creating one report
 MAX_WAITING: Final = 4  #: maximum number of waiting requests; a longer queue would take minutes to process
 NICENESS: Final = 10  #: niceness of the child: pages and flights have priority over reports
 _TAKEN: Final = 4096  # number of bytes kept from a child's error output

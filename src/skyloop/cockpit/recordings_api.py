@@ -199,7 +199,7 @@ class RecordingsApi:
         if not station.drone.uri.startswith("replay:"):
             raise UsageError(f"{name} is not a replay: only replays can be paused or repositioned")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
-        # Pause before changing the position, and resume after it: otherwise it would continue from the old position.
+        # Pause before changing the position and resume after it; otherwise it continues from the old position.
         values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
         pilot = await station.stopper()  # a connection for a pilot, used here without authority
         for parameter, value in values.items():

@@ -37,7 +37,7 @@ class RouteFiles:
     def load(self, name: str) -> Route:
         """Read a route.
 
-        Raise ``UnknownNameError`` if there is no route with that name, or ``SkyloopError`` if the file can't be read.
+        Raise ``UnknownNameError`` if there is no route with that name, and ``SkyloopError`` if the file can't be read.
         """
         path = self._path(name)
         if not path.is_file():

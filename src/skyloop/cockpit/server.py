@@ -43,7 +43,7 @@ _PING_S = 10.0  # a connection that does not answer for this long is closed
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may connect, and from where. The default is only this user, on this machine, as a pilot.
+    """Who may connect, and from where. By default, only this user can connect, on this machine, as a pilot.
 
     ``host``: the address to listen on; any address other than loopback requires ``token_file``, ``client_ca`` or
     ``pair``. ``token_file``: lines of the form ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the

@@ -75,7 +75,7 @@ class PagePath:
         self._under_way.append((number, size, now_ns))
 
     def acknowledged(self, number: int, now_ns: int) -> int:
-        """Record that the page has received a picture and all earlier ones; return how many are newly received."""
+        """Record that the page has received a picture and all earlier ones; return how many of these are new."""
         count = 0
         while self._under_way and self._under_way[0][0] <= number:
             self._trip_s = seconds(now_ns - self._under_way.popleft()[2])

@@ -223,7 +223,7 @@ class AuthorityReport:
             holder = None
         if holder is None:
             priority = None
-        if mine and pilot is not None:  # the lease is known here before feedback reports it
+        if mine and pilot is not None:  # our own lease is known here before feedback reports it
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)

@@ -141,7 +141,7 @@ class FrameKeeper:
             return self._kept.find(captured_ns)
 
     def catch_up(self, captured_ns: int) -> Arrival | None:
-        """Return the next frame to track while catching up, or None if none is newer."""
+        """Return the next frame to track while catching up, or None if there is no newer frame."""
         with self._news:
             return self._kept.next_after(captured_ns)
 
@@ -205,7 +205,7 @@ class FrameKeeper:
 
 
 def warm_up() -> None:
-    """Track once in a noise image, so that imports, which hold the GIL, do not stall flights later.
+    """Run a tracker once on a noise image, so that imports, which hold the GIL, do not stall flights later.
 
     SciPy, which matches detections, takes half a second to import on an idle computer and several seconds on a busy
     one. This function therefore runs when the cockpit starts, on a thread other than that of the event loop, rather

@@ -132,7 +132,7 @@ def flat_values(
 
 
 def set_point_values(action: AnyAction, age_s: float) -> Json:
-    """Convert a command, as it was applied, to JSON values."""
+    """Convert a command, in the form that was applied, to JSON values."""
     return {
         "action": ACTION_NAMES[type(action)],
         "values": {name: number(value) for name, value in _fields(action)},
@@ -226,7 +226,7 @@ class TelemetryView:
         self._channels_task: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """Return the values that change only with the vehicle."""
+        """Return the values that change only if the vehicle changes."""
         station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",

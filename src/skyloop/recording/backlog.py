@@ -29,7 +29,7 @@ class Item:
     drone: int  #: the drone's index in the recording
     channel: str  #: the channel's name in the drop counts: ``feedback``, ``video.front`` …
     rank: Rank
-    received_ns: int  #: time of reception on this process's monotonic clock
+    received_ns: int  #: time of reception, on this process's monotonic clock
     sample: Any
     size: int  #: approximate size [bytes]
 

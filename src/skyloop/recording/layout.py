@@ -187,8 +187,8 @@ class ResultRecord(msgspec.Struct, frozen=True):
     number: int
     camera: str
     seq: int  #: the frame's sequence number
-    captured_ns: int  #: when the frame was captured
-    made_ns: int  #: when the result was completed, on the proxy's clock
+    captured_ns: int  #: time at which the frame was captured
+    made_ns: int  #: time at which the result was completed, on the proxy's clock
     took_ns: int
     value: Any = None
 

@@ -36,7 +36,7 @@ class Picture:
     camera: str
     record: FrameRecord
     log_ns: int  #: time at which it was received, Unix time [ns]
-    publish_ns: int  #: when it was captured, Unix time [ns]
+    publish_ns: int  #: time at which it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
     group: tuple[Group, int] | None = None  #: the frame's group and its index in it, for decodable H.264
 

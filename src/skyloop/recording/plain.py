@@ -299,7 +299,7 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 
 
 _BACK_NS: Final = 10 * NS_PER_S  #: maximum time by which a sample's own time may lie before the newest time
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: maximum time by which it may lie after that time
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: maximum time by which it may lie after the newest time
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")
@@ -327,7 +327,7 @@ def shifted(value: Any, shift_ns: int) -> Any:
     names = [name for name in _TIMES if getattr(value, name, 0)]
     if names:
         return msgspec.structs.replace(value, **{name: getattr(value, name) + shift_ns for name in names})
-    if (header := getattr(value, "header", None)) is not None:  # a frame's record
+    if (header := getattr(value, "header", None)) is not None:  # the record of a frame
         return msgspec.structs.replace(value, header=shifted(header, shift_ns))
     record = getattr(value, "record", None)
     return value if record is None else replace(value, record=shifted(record, shift_ns))

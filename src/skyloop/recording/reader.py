@@ -55,7 +55,7 @@ class Series:
 
     topic: str
     schema: str
-    own: Topic | None  #: None for topics of viewers and of other programs
+    own: Topic | None  #: None for topics from viewers and from other programs
 
 
 @dataclass(slots=True)
@@ -218,7 +218,7 @@ class Recording:
         from_ns: int = 0,
         progress: Progress | None = None,
     ) -> Iterator[Item]:
-        """Yield Skyloop's own samples of a drone. Skip undecodable samples and note them in :attr:`damaged`.
+        """Yield Skyloop's own samples of a drone. Skip samples that can't be decoded, and list them in :attr:`damaged`.
 
         Args:
             drone: The drone's name.
@@ -266,7 +266,7 @@ class Recording:
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
-        """Decode a message from one of Skyloop's own channels; if damaged, note it in :attr:`damaged`, return None."""
+        """Decode a message from one of Skyloop's own channels; note damage in :attr:`damaged` and return None."""
         try:
             return layout.decode(entry.data, layout.TYPES[channel])
         except FileFormatError as error:
@@ -351,7 +351,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # raised when decoding a picture without a group
+            with suppress(FileFormatError):  # raised when a picture without a group is decoded
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 

@@ -346,7 +346,7 @@ class RerunLog:
         self._drones[drone].add(sample)
 
     def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
-        """Add a frame as an image file or H.264 access unit; the first H.264 frame must be a key frame."""
+        """Add a frame as an image file or an H.264 access unit; the first H.264 frame must be a key frame."""
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:

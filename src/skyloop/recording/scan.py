@@ -53,7 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # mcap's, for our other modules
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,7 +361,7 @@ _FOOTER: Final = struct.Struct("<QQI")  #: offset of the summary, offset of its 
 _TAIL: Final = FRAME.size + _FOOTER.size + len(MAGIC)
 _DATA_END: Final = FRAME.size + 4
 _INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset, length, bytes in the map that follows
-_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, compressed and uncompressed
+_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, first compressed, then uncompressed
 _U64: Final = struct.Struct("<Q")
 _U32: Final = struct.Struct("<I")
 

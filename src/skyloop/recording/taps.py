@@ -260,7 +260,7 @@ class Video:
 
     @property
     def missed(self) -> int:
-        """Frames that never arrived."""
+        """Number of frames that never arrived."""
         return self.gaps.missed + (self._stream.gaps.missed if self._stream is not None else 0)
 
     def start(self) -> None:

@@ -32,8 +32,8 @@ class Settings:
     """
 
     drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace
-    #: request control authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
-    #: service. If None, only the service requests it, with the default priority.
+    #: if set, request control authority immediately with this priority, 0 (highest) to 31; the service uses it too. If
+    #: None, only the service requests it, with the default priority.
     priority: int | None = None
     #: the drone hovers if no cmd_vel arrives for this long; must be greater than 0 and at most 5 s
     timeout_s: float = 0.5

@@ -33,7 +33,7 @@ FEW_PAIRS = 6
 class Contacts:
     """The contacts during one step."""
 
-    standing: set[int] = field(default_factory=set)  #: drones standing on something other than a drone
+    standing: set[int] = field(default_factory=set)  #: drones standing on an object that is not a drone
     #: pairs of drones of which one stands on the other, with the upper drone first
     upon: list[tuple[int, int]] = field(default_factory=list)
     #: drone, speed along the normal [m/s], and name of the other object
@@ -69,7 +69,7 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits of centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for the centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
@@ -83,7 +83,7 @@ class Collisions:
         self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
         self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # step of the next broad phase
-        self._reach = np.zeros(len(parameters))  # distance that each drone can cover until then
+        self._reach = np.zeros(len(parameters))  # distance that each drone can cover before the next broad phase
         self._extra_reach = [0.0 for _ in parameters]  # additional movement that pushes and impacts cause
         self._run_broad_phase(0)
         self._next = 0

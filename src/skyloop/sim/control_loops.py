@@ -268,7 +268,7 @@ class ControlLoops:
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Compute roll and pitch from the velocity error. The integral is in world axes, where yaw doesn't affect wind.
+        # Compute roll and pitch from the velocity error. The integral is in world axes, where yaw does not affect wind.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S

@@ -89,7 +89,7 @@ class BodyTable(ABC):
         self._table = table
         #: Roll, pitch, yaw, (3, n) [rad], yaw not wrapped; derivatives; input: roll, pitch [rad], yaw rate [rad/s].
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
-        #: Input and actual value: thrust per mass, (n,) [m/s²].
+        #: Input and actual value: thrust divided by mass, (n,) [m/s²].
         self.thrust_command, self.thrust = table[12], table[22]
         #: Sines and cosines of the angles; as an input, the velocity of the air, (3, n) [m/s].
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))

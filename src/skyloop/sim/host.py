@@ -68,7 +68,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held while stepping; a thread that is ending may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, as a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; always replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}

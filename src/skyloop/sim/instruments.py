@@ -144,7 +144,7 @@ Ranging = Callable[[Vec3, Vec3], float]
 _NOISE_BLOCK = 256  # number of samples whose noise is drawn in one call
 _WANDER_STEPS = 100  # number of steps between changes of the biases (10 Hz)
 _LEAST_FLOW_M = 0.08  # minimum height; below it, the image is out of focus
-_GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal one
+_GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal error
 _SATELLITES = 14
 
 

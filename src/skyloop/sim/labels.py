@@ -89,7 +89,7 @@ class Labeller:
 def pictures(
     world: World,  # the world
     seed: int,  # seed of the positions and times
-    count: int,  # number of images
+    count: int,  # number of images to yield
     size: tuple[int, int] = (320, 240),  # width and height of the images [px]
     focal_share: float = 0.75,  # focal length as a fraction of the width
     *,

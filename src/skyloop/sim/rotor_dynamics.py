@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors, by commanding them beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]

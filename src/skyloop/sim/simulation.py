@@ -263,7 +263,7 @@ class Simulation:
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """Return a drone's estimates. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 12 ms older; their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()

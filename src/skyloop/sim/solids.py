@@ -105,7 +105,7 @@ class Solids:
         return found
 
     def sizes(self, numbers: Indices, hulls: Floats) -> Floats:
-        """Return the half sizes of solids enlarged by hulls (3, m), shape (3, m)."""
+        """Return the half sizes of solids, enlarged by hulls (3, m), shape (3, m)."""
         grown: Floats = self._half[:, :, 0].take(numbers, axis=1) + hulls
         return grown
 

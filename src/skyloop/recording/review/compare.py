@@ -209,7 +209,7 @@ def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
 
     Raises:
         UsageError: The file can't be written.
-        MissingExtraError: Matplotlib is required but not installed.
+        MissingExtraError: Matplotlib is required but is not installed.
     """
     if path.suffix == ".png":
         _picture(found, old, new, path)

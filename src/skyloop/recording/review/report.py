@@ -418,7 +418,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    It has full size if it can't be scaled here, and is empty if damaged or if it is H.264 that can't be decoded here.
+    The image has full size if it can't be scaled here. It is empty if damaged or H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

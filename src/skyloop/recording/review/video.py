@@ -55,7 +55,7 @@ def export_mp4(
 
     H.264 is copied as recorded, without decoding, if nothing is drawn on the frames. If its size or another parameter
     changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing frames are omitted.
-    All other images are encoded into one file, without damaged frames and frames whose size differs from the first.
+    All other images are encoded into one file, omitting damaged frames and frames that differ in size from the first.
 
     Args:
         recording: The recording.
@@ -362,7 +362,7 @@ class _File:
         self.parameters = parameters
         self.width, self.height = template.width, template.height
         self.frames = 0
-        # PyAV would open the file only at the first frame, and raise exceptions of its own.
+        # PyAV would not open the file until the first frame, and would raise its own exceptions.
         self._target = opened.enter_context(part.open("wb"))
         self._container: Any = opened.enter_context(av.open(self._target, "w", format="mp4"))
         self._stream = self._container.add_stream_from_template(template.stream)

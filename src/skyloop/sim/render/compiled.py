@@ -179,7 +179,7 @@ class Compiler:
 def load_kernels() -> Kernels:
     """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
-    RuntimeError if Numba's cache is not writable, because every start would then spend seconds compiling.
+    Raise RuntimeError if Numba's cache is not writable, because every start would then spend seconds compiling.
     """
     import numba
 

@@ -149,7 +149,7 @@ _BLUR_FROM_PX = 0.8  # minimum length at which blur is visible
 
 
 class SensorEffects:
-    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use from one thread at a time.
+    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
 
     The imperfections of frame ``number`` depend only on the seed and that number, not on earlier frames.
     """
