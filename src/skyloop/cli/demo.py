@@ -60,7 +60,7 @@ def demo(
         bool, typer.Option("--json", help="Print the figures as one JSON object; the rest goes to standard error")
     ] = False,
 ) -> None:
-    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands."""
+    """Take off in a simulated room, find the marker, and follow it at 1.5 m with the camera. Ctrl-C lands."""
     console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
     if json:

@@ -111,7 +111,7 @@ def add(
 ) -> None:
     """Add vehicles to a running host: one by its address, all vehicles in a file, or one from the host's own file.
 
-    A vehicle given by address has the defaults of the host's file. Vehicles that are already running are not affected.
+    A vehicle given by address uses the defaults of the host's file. Vehicles that are already running are not affected.
     """
     from skyloop.host.fleet import read_fleet
     from skyloop.host.serve import Add, AddNamed

@@ -110,7 +110,7 @@ class Hands:
         self._pressed: dict[Axis, tuple[int, float]] = {}
         self._held_over: dict[str, float] = {}  # stick keys held during a landing, and the times of their last repeats
         self._moving = False  # whether the last step moved a stick
-        self._landed_s = -math.inf  # time of the last L
+        self._landed_s = -math.inf  # time of the last press of L
         self._stopped_s = -math.inf  # time of the last stop
         self._escaped_s = -math.inf  # time of the last Esc, unless another key has followed
         self._second: tuple[float, float] | None = None  # the second Esc: its time, and the time since the first one

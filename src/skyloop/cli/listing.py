@@ -43,8 +43,8 @@ class Row(msgspec.Struct, frozen=True):
     owner: str | None = None
     vehicle_link: str = ""
     problem: str = ""
-    link_reason: str = ""  #: why the vehicle's link is not up
-    link_remedy: str = ""  #: how to fix it
+    link_reason: str = ""  #: reason why the vehicle's link is not up
+    link_remedy: str = ""  #: advice on how to fix the link
 
 
 def list_proxies(

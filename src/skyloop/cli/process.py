@@ -201,7 +201,7 @@ def detect(
 
     Without FILE, it finds the simulator's people, cars and crates: person, car, box. For a real camera, give FILE. The
     results carry their frame's time and are published as a processor's results: drone.results("detections"). Run the
-    same command again to start another worker that shares the frames. A line each second shows the progress.
+    same command again to start another worker that shares the frames. Progress is printed as one line per second.
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector

@@ -436,8 +436,8 @@ class _Content(msgspec.Struct):
 class SessionFile:
     """Stores the sessions of one cockpit, so that after a restart a page reconnects without logging in again.
 
-    Only this user may read the file, next to the proxies' sockets. It contains hashes of cookies and tokens, which
-    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
+    Only this user may read the file, which is next to the proxies' sockets. It contains hashes of cookies and tokens,
+    which can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:

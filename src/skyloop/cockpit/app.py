@@ -56,7 +56,7 @@ from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
-SMALLEST_PACKED: Final = 1000  #: minimum size of an answer worth compressing [bytes]
+SMALLEST_PACKED: Final = 1000  #: minimum size of a response worth compressing [bytes]
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')

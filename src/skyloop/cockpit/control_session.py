@@ -441,7 +441,7 @@ class ControlSession:
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
     def _end_flight(self, why: str = "another command was given, or the page was silent") -> None:
-        """End the page's previous flight. A route, by contrast, is paused and can be resumed."""
+        """End the page's previous flight. A route, by contrast, is only paused and can be resumed."""
         self._decisions += 1
         if self._decided != self._last_command:  # earlier intents, and refusals of them, belong to the previous command
             self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
@@ -562,7 +562,7 @@ class ControlSession:
         try:
             async with self._turn:
                 problem = untimely(command, seconds(self._clock()))
-                if problem:  # earlier jobs took too long
+                if problem:  # the earlier jobs took too long
                     raise RefusedError(problem)
                 await work(command)
         except SkyloopError as error:

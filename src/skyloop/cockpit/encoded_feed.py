@@ -197,7 +197,7 @@ class SmallFeed:
     def age_s(self) -> float | None:
         """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
+        None while no page shows the camera, and before the first frame, which a vehicle may take seconds to send.
         """
         if not self.wanted or not self.encoded:
             return None

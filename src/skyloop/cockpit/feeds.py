@@ -126,7 +126,7 @@ class Newest(Generic[K, V]):
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: number of values refused for lack of room
+        self.refused = 0  #: number of values refused because there was no room
         self._most = most
         self._clock = clock
         self._values: dict[K, tuple[int, V]] = {}  # each with its arrival time; the most recently updated comes last
@@ -239,7 +239,7 @@ class EventFeed:
 class LogFeed:
     """The logs of applications, and the last command applied.
 
-    Subscribed to only on demand, to save the proxy work. The client's receiving thread replaces the values as a whole.
+    Subscribed to only on demand, to spare the proxy work. The client's receiving thread replaces the values as a whole.
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:

@@ -120,7 +120,7 @@ class Admission:
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
         """Record that a complete request has arrived.
 
-        ``person``: who sent it; None for a stranger. Return why the request is refused, or "" if it is accepted.
+        ``person``: the sender, or None for a stranger. Return why the request is refused, or "" if it is accepted.
         """
         if person is None:
             connection.asked = True

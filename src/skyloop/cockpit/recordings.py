@@ -429,7 +429,7 @@ class Reports:
             target = Path(folder) / "report.html"
             child = await asyncio.create_subprocess_exec(
                 *self._command(file.absolute(), target, drone),
-                stdin=asyncio.subprocess.PIPE,  # closed when this process ends
+                stdin=asyncio.subprocess.PIPE,  # closed when this process ends, which ends the child
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,
             )

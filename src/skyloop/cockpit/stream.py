@@ -41,7 +41,7 @@ QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stre
 MOST_QUIET_S: Final = 160.0
 SILENT_S: Final = 3.0  #: give up on a stream after this long without a picture
 RETRY_S: Final = 10.0  #: first pause before the stream is tried again; doubled each time
-MOST_RETRY_S: Final = 300.0  #: longest pause; a proxy that refuses the stream logs each attempt
+MOST_RETRY_S: Final = 300.0  #: longest pause; a proxy that refuses the stream reports each attempt
 MOST_UNDER_WAY: Final = 8  #: maximum number of pictures that are sent but not acknowledged yet
 MOST_BYTES: Final = 1_000_000  #: maximum total size of these pictures [bytes]; a single picture may be larger
 
@@ -139,7 +139,7 @@ class PageStream:
         self._clock = clock
         self._name = ""  # name of the page's own stream, if it has one
         self._feed: EncodedFeed | None = None
-        self._next: EncodedFeed | None = None  # will replace the current stream at its first key frame
+        self._next: EncodedFeed | None = None  # the stream that will replace the current one at its first key frame
         self._serial = 0  # number of the last picture sent
         self._follows = True  # whether the page can decode the next picture
         self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message number, feed and picture number

@@ -148,7 +148,7 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Start over, because the page requests the authority."""
+        """Start over, because the page has requested authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:

@@ -1,4 +1,4 @@
-"""A drone's surroundings: the scenery, where it may fly, where its cameras point. Also whether the drone is ready.
+"""A drone's surroundings: the scenery, where it may fly, and where its cameras point; also whether the drone is ready.
 
 All of these requests are read-only.
 """

@@ -370,7 +370,7 @@ class Described(msgspec.Struct, frozen=True):
     started: float | None = None  #: Unix time [s], or None if unknown
     drones: tuple[str, ...] = ()
     seconds: float | None = None  #: time from the first message to the last
-    problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
+    problem: str = ""  #: reason why it is unreadable or incomplete; empty if it is complete
 
 
 def shown_name(path: Path) -> str:

@@ -207,7 +207,7 @@ class Recorder:
 
     @property
     def reason(self) -> str:
-        """Why the recording is paused or has failed."""
+        """The reason why recording is paused or has failed."""
         return self.status.reason
 
     @property
@@ -351,7 +351,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 
     status: Status | None = None
     event: RecorderEvent | None = None
-    trouble: str = ""  #: why the child could not start
+    trouble: str = ""  #: reason why the child could not start
     usage: bool = False  #: whether the cause was a UsageError
 
 

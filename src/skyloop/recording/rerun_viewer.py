@@ -353,7 +353,7 @@ class RerunLog:
         """Return whether the viewer or disk accepts all added samples within this time [s], which must be positive."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
-        except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
+        except Exception:  # noqa: BLE001 (Rerun raises its own exceptions, which have no common base)
             return False
         return True
 

@@ -139,7 +139,7 @@ class RecordingFile:
 
     @property
     def lost(self) -> bool:
-        """Whether the file was deleted. A file that was only moved is still written to."""
+        """Whether the file has been deleted. A file that was only moved is still written to."""
         try:
             return os.fstat(self._target.fileno()).st_nlink == 0
         except OSError:
@@ -210,7 +210,7 @@ class FileWriter:
     ) -> None:
         """Initialise without opening a file. ``tell`` is called on the writing thread or, at first, :meth:`start`'s."""
         self.state = RecorderState.STARTING  #: state of the recorder
-        self.reason = ""  #: why the recorder is paused or has failed
+        self.reason = ""  #: reason why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
         self.room = Room.ALL  #: which samples to write, depending on the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated

@@ -28,7 +28,7 @@ _WAITING: Final = 4  #: maximum number of a drone's services that may wait at th
 class Settings:
     """Options of a bridge.
 
-    Raise ``UsageError`` if a value is out of range, or two drones have the same name in ROS 2.
+    Raise ``UsageError`` if a value is out of range, or if two drones have the same name in ROS 2.
     """
 
     drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace

@@ -125,7 +125,7 @@ _KEPT_OCCURRENCES = 1000
 
 
 class Autopilot:
-    """Flight states and set-points of all drones. Times are simulation times."""
+    """Flight states and set-points of all drones. Times are in simulation time."""
 
     def __init__(
         self,

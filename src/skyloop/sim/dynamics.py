@@ -26,7 +26,7 @@ FEW = 3  #: maximum number of drones that are computed one at a time
 
 
 def few(drones: int) -> bool:
-    """Return whether so few drones are computed one at a time."""
+    """Return whether this number of drones is computed one at a time."""
     return drones <= FEW
 
 

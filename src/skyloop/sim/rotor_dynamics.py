@@ -95,7 +95,7 @@ class Constants:
 
 
 def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
-    """Return a vehicle's rotors; UsageError if it has none because its response is modelled as a whole."""
+    """Return a vehicle's rotors; raise UsageError if it has none because its response is modelled as a whole."""
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
     return vehicle.rotors

@@ -261,7 +261,7 @@ class RotorBodies(BodyTable):
 
 
 class _Pilot:
-    """Exchanges readings and commands with a drone's firmware."""
+    """Exchanges readings and commands with the firmware of a drone."""
 
     def __init__(self, bodies: RotorBodies, drone: int, firmware: Firmware, instruments: Instruments) -> None:
         self._bodies = bodies

@@ -214,7 +214,7 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files; the one commonly used for video
 MAX_FILES: Final = 50  #: maximum number of files; a stream that would need more is encoded instead
 _LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames; 31 bits hold less than seven hours
-_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration given to the last image
+_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration assigned to the last image
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class StreamCopy:
     def add(self, picture: Picture) -> None:
         """Copy a frame or skip it.
 
-        Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, or ``OSError`` if the
+        Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, and ``OSError`` if the
         file can't be written.
         """
         file = self._file_for(picture)

@@ -208,7 +208,7 @@ def draw(
     colours = np.empty(room, np.int32)
     depth, shade = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     flat_x, flat_y = ray_x.reshape(-1), ray_y.reshape(-1)
-    known = compared = 0  # counts of grid rows
+    known = compared = 0  # numbers of grid rows
     for begin in range(0, height * width, BLOCK):
         count_ = min(BLOCK, height * width - begin)
         first_row, last_row = begin // width, (begin + count_ - 1) // width

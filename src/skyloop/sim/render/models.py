@@ -385,7 +385,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 
 
-_CELL = 24  # texels per cell of the marker
+_CELL = 24  # number of texels per cell of the marker
 _PAPER = 235
 
 
