@@ -389,7 +389,7 @@ class WrongTokens:
     def __init__(self, clock: Clock = monotonic_ns) -> None:
         self.count = 0  #: number of wrong tokens since startup
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # count and time of the last wrong token; quietest first
+        self._of_address: dict[str, tuple[int, int]] = {}  # number of wrong tokens, time of the last; quietest first
         self._minute_ns = clock()
         self._in_minute = 0
 
