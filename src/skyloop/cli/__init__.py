@@ -12,7 +12,7 @@ INTERRUPTED: Final = 130  #: 128 + SIGINT, the convention of shells
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; see :func:`skyloop.cli.app.main`. Ctrl-C works even during imports."""
+    """Run the command line and exit; see :func:`skyloop.cli.app.main`. Ctrl-C works even while modules are imported."""
     try:
         from skyloop.cli import app
 
@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
 def interrupt_by_signals(numbers: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM)) -> None:
     """Raise KeyboardInterrupt on SIGTERM, and also on SIGINT, which shells ignore for background jobs.
 
-    On threads other than the main one, do nothing.
+    On threads other than the main thread, do nothing.
     """
 
     def interrupt(*_: object) -> NoReturn:

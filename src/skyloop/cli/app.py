@@ -42,7 +42,7 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line. Only the modules of the given commands are imported now, all others on demand."""
+    """Return the command line. Only the modules of the given commands are imported now; others, on demand."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,
@@ -115,7 +115,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
-    except ImportError as error:  # a missing package that no module of Skyloop checks for
+    except ImportError as error:  # a package is missing, but no module of Skyloop checks for it
         from skyloop.cli.install import missing
 
         entry = entry_of(arguments)
@@ -129,7 +129,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
 def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
     _log.debug("the command failed", exc_info=error)
     told, entry = error_text(error), entry_of(arguments)
-    if entry is not None and install_command("") in told:  # its own error, or that of a proxy it started
+    if entry is not None and install_command("") in told:  # the command's own error, or that of a proxy it started
         from skyloop.cli.install import with_all_missing
 
         told = with_all_missing(told, entry.extras)
@@ -163,17 +163,17 @@ def _skyloop(
 ) -> None:
     """Fly small drones by their cameras: simulated or real, one or several.
 
-    skyloop COMMAND --help describes a command, with an example.
+    skyloop COMMAND --help describes a command and gives an example.
     """
 
 
 def width() -> int:
-    """Return the width of help texts in columns: that of the terminal, but at most 80."""
+    """Return the width of help texts in columns: the terminal's width, but at most 80."""
     return max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns) - 2)
 
 
 class Command(TyperCommand):
-    """A command whose help shows its arguments the way they are typed: ``NAME``, or ``[NAME]`` if optional.
+    """A command whose help shows its arguments as the user types them: ``NAME``, or ``[NAME]`` if optional.
 
     An argument's ``metavar`` is shown verbatim: NAME is optional for Typer, because ``--drone`` may be used instead.
     """
@@ -188,7 +188,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """A command with subcommands, listed with their full summaries, wrapped if necessary."""
+    """A command with subcommands; they are listed with their full summaries, wrapped if necessary."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
@@ -216,7 +216,7 @@ class ByTask(Group):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command, creating it if necessary, or None if it is unknown."""
         if cmd_name not in COMMANDS:
-            for name in COMMANDS:  # Typer searches these for similar names
+            for name in COMMANDS:  # Typer searches this list for similar names
                 self.get_command(ctx, name)
         elif cmd_name not in self.commands:
             made: Any = typer.main.get_command(build([cmd_name]))
@@ -224,7 +224,7 @@ class ByTask(Group):
         return self.commands.get(cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
-        """Write the list of commands without creating any."""
+        """Write the list of commands without creating any of them."""
         write_sections(
             formatter, {task: [(n, e.summary) for n, e in COMMANDS.items() if e.task is task] for task in Task}
         )
@@ -250,7 +250,7 @@ def argument_words(command: Any, ctx: Any) -> list[str]:
 
 
 def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return a command's words and their meanings, as ``Arguments`` and ``Options`` if it has any."""
+    """Return the words of a command with their descriptions, as ``Arguments`` and ``Options`` if it has any."""
     arguments, options = [], []
     for param in command.get_params(ctx):
         if param.param_type_name == "argument":
@@ -262,7 +262,7 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write the arguments by name and the options with their values."""
+    """Write the arguments by name, and the options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

@@ -1,4 +1,4 @@
-"""``skyloop bench``: measures this machine's delays, next to those of a bare hand-over, and the simulator's speed."""
+"""``skyloop bench``: measures this machine's delays next to those of a bare hand-over, and the simulator's speed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def bench(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")] = False,
 ) -> None:
-    """Measure the delays on this machine (median and 99th percentile), or the speed of the simulator.
+    """Measure the delays on this machine (median and 99th percentile) or the speed of the simulator.
 
     Close all other programs first.
     """
@@ -73,7 +73,7 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
 
 
 def delay_table(results: DelayResults) -> Table:
-    """Return a table of the delays, with those of a bare hand-over for comparison."""
+    """Return a table of the delays, together with those of a bare hand-over for comparison."""
     rows = [
         (
             f"{row.channel} {row.size}" if row.channel == "video" else row.channel,
@@ -106,7 +106,7 @@ def physics_table(results: SimResults) -> Table:
 
 
 def drawing_table(results: SimResults) -> Table:
-    """Return a table for images that include the sensor's flaws."""
+    """Return a table for images that include sensor imperfections."""
     rows = [
         (
             row.cameras,

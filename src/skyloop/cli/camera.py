@@ -32,7 +32,7 @@ _MAX_BYTES: Final = 256 << 20  #: maximum size of an image file
 _PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _GOOD_COVERAGE: Final = 0.5
 _GOOD_RMS_PX: Final = 1.0
-_PATIENCE_S: Final = 10.0  # maximum time to wait for a frame
+_PATIENCE_S: Final = 10.0  # maximum time spent waiting for a frame
 
 
 class Kind(StrEnum):
@@ -54,9 +54,9 @@ Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The markers of a 
 
 @camera.callback()
 def _camera() -> None:
-    """Print a board, calibrate a camera with images of it, and list this machine's cameras.
+    """Print a calibration board, calibrate a camera with images of it, and list this machine's cameras.
 
-    skyloop camera COMMAND --help describes each.
+    skyloop camera COMMAND --help describes each command.
     """
 
 
@@ -70,7 +70,7 @@ def board(
     dictionary: Dictionary = "4x4_50",
     dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a .png")] = 300,
 ) -> None:
-    """Write a calibration board; the default fits A4. Print it at 100 %, and glue it onto something flat."""
+    """Write a calibration board; the default fits A4. Print the board at 100 %, and glue it onto something flat."""
     made = _board(columns, rows, square_mm, kind, dictionary)
     made.save(output, dpi)
     size = f"{(columns + 1) * square_mm:g} × {(rows + 1) * square_mm:g} mm"
@@ -104,8 +104,8 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length, principal point and distortion, and write them to a JSON file.
 
-    Show the board near and far, in all corners of the image, and tilted. Views that differ enough are taken
-    automatically; press Ctrl-C to stop early.
+    Show the board close up and from a distance, in all corners of the image, and tilted. Views that differ enough are
+    taken automatically; press Ctrl-C to stop early.
     """
     from skyloop.vision.calibrating import BoardFinder
     from skyloop.vision.calibrating import calibrate as fit
@@ -149,7 +149,7 @@ class _Search:
     """Searches images for the board, one after another."""
 
     def __init__(self, finder: BoardFinder, most: int) -> None:
-        self.every = False  #: whether to use every view, as for single images, or only different ones, as for a stream
+        self.every = False  #: whether to use every view (single images) or only views that differ (a stream)
         self.collector: Collector | None = None
         self.looked = 0
         self._finder = finder
@@ -212,7 +212,7 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
 
 
 def _are_files(source: list[str]) -> bool:
-    """Return whether the sources are files. Raise ``UsageError`` if some are files and some are not."""
+    """Return whether the sources are files. Raise ``UsageError`` if only some of them are files."""
     files = [Path(name).is_file() for name in source]
     if any(files) and not all(files):
         raise UsageError(f"no file {source[files.index(False)]!r}: give only files, or one vehicle")
@@ -245,7 +245,7 @@ def _from_picture(cv: Any, name: str) -> Any:
 
     content = read_bytes(name, "the picture", _MAX_BYTES)
     picture = None
-    if image_size(content) is None or not why_not_decoded(content):  # OpenCV itself limits the size of other formats
+    if image_size(content) is None or not why_not_decoded(content):  # OpenCV itself limits images in other formats
         picture = cv.imdecode(np.frombuffer(content, np.uint8), cv.IMREAD_COLOR) if content else None
     if picture is None:
         raise UsageError(f"{name} can't be read as an image")
@@ -268,7 +268,7 @@ def _from_video(cv: Any, name: str) -> Iterator[Picture]:
 
 
 class _Vehicle:
-    """A vehicle's camera, used for a limited time; a context manager."""
+    """A vehicle's camera that is used for a limited time; a context manager."""
 
     def __init__(self, source: str, camera: str | None, seconds: float) -> None:
         from skyloop.client import connect
@@ -287,7 +287,7 @@ class _Vehicle:
         self._drone.close()
 
     def pictures(self) -> Iterator[Picture]:
-        """Yield the newest frames until the time is over or no more arrive."""
+        """Yield the newest frames until the time is up or no more frames arrive."""
         end = time.monotonic() + self._seconds
         try:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
@@ -299,7 +299,7 @@ class _Vehicle:
             tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
-        """Draw the detected board on the video in the cockpit."""
+        """Draw the detected board on the video shown in the cockpit."""
         from skyloop.messages import Points
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)

@@ -1,4 +1,4 @@
-"""``skyloop cockpit``: a page in the browser to watch and fly drones."""
+"""``skyloop cockpit``: a web page to watch and fly drones."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def cockpit(
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
-    Only programs of the same user on this machine are admitted, unless tokens or certificates admit others.
+    Only programs of the same user on this machine are admitted, unless tokens or certificates admit other users.
     """
     from skyloop.cockpit import Access, serve_cockpit, with_certificate
     from skyloop.network.config import choose

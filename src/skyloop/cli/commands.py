@@ -1,4 +1,4 @@
-"""All commands of ``skyloop``, grouped by task, one line each. To add a command, add a line.
+"""All commands of ``skyloop``, grouped by task, with one line for each. To add a command, add a line.
 
 Help and error messages are based on this table; a command's module is imported when the command is used.
 """
@@ -22,15 +22,15 @@ class Task(StrEnum):
 
 
 class Entry(NamedTuple):
-    """One command: where its function is, its line in the list of commands, an example and what it requires."""
+    """One command: the location of its function, its line in the list of commands, an example and its requirements."""
 
     task: Task
-    home: str  # module in skyloop.cli, and function
-    summary: str  # up to 60 characters, so that the list fits into 80 columns
+    home: str  # module in skyloop.cli, and the function in it
+    summary: str  # up to 60 characters long, so that the list fits into 80 columns
     example: str
-    extras: tuple[str, ...] = ()  # optional parts that it needs; an error names all missing ones
+    extras: tuple[str, ...] = ()  # optional parts that the command needs; an error names all that are missing
     settings: Mapping[str, Any] = {}
-    behaviours: Mapping[str, Entry] = {}  # commands that run instead if their name is the first word
+    behaviours: Mapping[str, Entry] = {}  # commands that run instead if the first word is their name
 
     @property
     def module(self) -> str:
@@ -164,7 +164,7 @@ COMMANDS: Final = {
 
 
 def entry_of(words: Sequence[str]) -> Entry | None:
-    """Return the command selected by the words of a command line, or None if there is none or it is unknown."""
+    """Return the command selected by the words of a command line, or None if there is no command or it is unknown."""
     plain = [word for word in words if not word.startswith("-")]
     entry = COMMANDS.get(plain[0]) if plain else None
     return entry if entry is None or len(plain) < 2 else entry.behaviours.get(plain[1], entry)

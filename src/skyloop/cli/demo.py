@@ -1,4 +1,4 @@
-"""``skyloop demo``: a simulated drone finds a marker, follows it by camera, and reports how well it did."""
+"""``skyloop demo``: a simulated drone finds a marker, follows it by camera, and reports how well this went."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def demo(
         bool, typer.Option("--json", help="Print the figures as one JSON object; the rest goes to standard error")
     ] = False,
 ) -> None:
-    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands."""
+    """Take off in a simulated room, find the marker, and follow it at 1.5 m with the camera. Ctrl-C lands."""
     console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
     if json:
@@ -88,7 +88,7 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
-        """Fly the demonstration; ``port`` is None for the default. Errors during connecting and take-off are raised."""
+        """Fly the demonstration; ``port`` is None for the default. Errors while connecting or taking off are raised."""
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
@@ -140,7 +140,7 @@ def _page_counts(page: CockpitProcess) -> dict[str, Any] | None:
 
 
 def _status(drone: Drone, follower: FollowMarker) -> Text:
-    """Return the status line, updated in place."""
+    """Return the status line, which is updated in place."""
     feedback, score = drone.feedback(), follower.score
     frame = drone.frame()
     share = score.share_in_view
@@ -168,7 +168,7 @@ def drone_and_page(
 ) -> Iterator[tuple[Drone, CockpitProcess | None, float]]:
     """Connect to a vehicle, wait for its first image, and show the page.
 
-    ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port;
+    ``name``: the pilot's name as shown to others. ``stop``: called on the first Ctrl-C. ``port``: the page's port, or
     None for the default. Yield the drone, the page if there is one, and the time of the first image (monotonic) [s].
     """
     from skyloop.client import connect
@@ -187,7 +187,7 @@ def drone_and_page(
 
 
 def _show(page: CockpitProcess, console: Console, browser: bool) -> None:
-    """Print the page's address and open the page. If there is no page, the demonstration continues."""
+    """Print the page's address and open the page. If there is no page, the demonstration continues without it."""
     try:
         address = page.address()
     except LinkError as error:
@@ -261,7 +261,7 @@ def true_range(native: dict[str, Value] | None) -> float | None:
 
 
 class TruthMeter:
-    """Compares the true distance to the desired one while the marker is followed, within a ``with`` block."""
+    """Compares the true distance with the desired one while the marker is followed, within a ``with`` block."""
 
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:
         self.errors_m: list[float] = []
@@ -284,7 +284,7 @@ class TruthMeter:
 
 @dataclass(slots=True)
 class DemoReport:
-    """The results of a demonstration, and their table."""
+    """The results of a demonstration, and a table of them."""
 
     first_picture_s: float | None = None  #: measured from the start of the demo
     frames: int = 0  #: number of frames since the marker was first seen
@@ -296,7 +296,7 @@ class DemoReport:
     collisions: int = 0
 
     def take(self, drone: Drone, score: FollowScore, truth: TruthMeter, page: dict[str, Any] | None) -> None:
-        """Record everything that must be read while the drone is still connected."""
+        """Record all data that must be read while the drone is still connected."""
         self.frames = score.frames
         self.share_in_view = score.share_in_view
         self.estimated = Spread.of(score.range_errors_m(SETTLING_S))
@@ -305,11 +305,11 @@ class DemoReport:
         self.page = page
 
     def good(self, enough: float) -> bool:
-        """Return whether the marker was found, and was then in view in at least this fraction of the frames."""
+        """Return whether the marker was found and was then visible in at least this fraction of the frames."""
         return self.share_in_view is not None and self.share_in_view >= enough
 
     def verdict(self, enough: float) -> str:
-        """Return why the result is bad."""
+        """Return the reason why the result is bad."""
         if self.share_in_view is None:
             return "the marker was never seen"
         return f"the marker was in view in {self.share_in_view:.1%} of the frames, less than {enough:.0%}"
@@ -340,7 +340,7 @@ def _spread_text(spread: Spread | None) -> str:
 
 
 def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
-    """Return a channel's row, or no row if the channel is unused."""
+    """Return a channel's row, or no row if the channel is not in use."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

@@ -1,7 +1,7 @@
-"""Check-ups: ``skyloop doctor`` checks this machine or one vehicle, ``skyloop preflight`` a drone before a flight.
+"""Diagnostics: ``skyloop doctor`` checks this machine or one vehicle, ``skyloop preflight`` a drone before a flight.
 
 ``skyloop doctor`` lists what works and what must be installed for the rest; ``skyloop doctor ADDRESS`` connects to one
-vehicle and lists the settings that need attention. None of them flies the vehicle.
+vehicle and lists the settings that need attention. None of these checks flies the vehicle.
 """
 
 from __future__ import annotations
@@ -47,25 +47,25 @@ PORTS: Final = (
     ("UDP", 5554, "AR.Drone's navdata"),
     ("TCP", 7447, "routers"),
 )
-ANSWER_S: Final = 3.5  #: time for a vehicle to answer; chosen so that the user gets a result within 5 s
-PATIENCE_S: Final = 40.0  #: time limit for reading the settings of a vehicle that answers
+ANSWER_S: Final = 3.5  #: time allowed for a vehicle to answer; chosen so that the user gets a result within 5 s
+PATIENCE_S: Final = 40.0  #: time limit for reading the settings of a vehicle that responds
 FEEDBACK_S: Final = 3.0
-SETTLE_S: Final = 2.0  #: time for faults to clear that our first messages fix, such as a missing stick input
+SETTLE_S: Final = 2.0  #: time to wait for faults to clear that our first messages fix, such as a missing stick input
 LOOK_S: Final = 0.1
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
 STATE_S = 2.0
-VIDEO_S = 5.0  #: time limit for the first image; a Tello that was just switched on takes some seconds
+VIDEO_S = 5.0  #: time limit for the first image; a Tello that has just been switched on takes several seconds
 
 
 class Health(StrEnum):
     GOOD = "good"
-    MISSING = "missing"  #: everything else works without it
+    MISSING = "missing"  #: everything else works without this part
     BAD = "bad"
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the report, followed by a line of advice if there is any."""
+    """One line of the report, followed by a line of advice if there is advice."""
 
     what: str
     health: Health
@@ -89,9 +89,9 @@ def doctor(
     ] = "",
     json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
-    """Check Python, the local transport, every optional part, cameras, ports, drivers and proxies; or one vehicle.
+    """Check Python, the local transport, all optional parts, cameras, ports, drivers and proxies; or check one vehicle.
 
-    Marks: ✓ works, – an optional part is missing or a vehicle's safety net is off, ✗ broken. The exit code is 1 if
+    Marks: ✓ works, – an optional part is missing or a vehicle's safety net is disabled, ✗ broken. The exit code is 1 if
     something is broken.
     """
     console = Console(soft_wrap=True)
@@ -253,7 +253,7 @@ def _ports() -> Iterator[Finding]:
 
 
 def _free(kind: str, port: int) -> bool:
-    """Return whether a program could listen on this port."""
+    """Return whether a program could bind this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
         if kind == "TCP":  # as servers do, so that a recently closed port counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -355,9 +355,9 @@ def preflight(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Check a drone before a flight: link, battery, position, zones, video, its own failsafes. Flies nothing.
+    """Check a drone before a flight: its link, battery, position, zones, video and built-in failsafes. Flies nothing.
 
-    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. The exit code is 1 with any ✗.
+    Marks: ✓ ready, ! missing but not required, ✗ prevents a flight or makes it unsafe. Exit code 1 if there is any ✗.
     """
     from contextlib import suppress
 

@@ -1,4 +1,4 @@
-"""``skyloop land``, ``return`` and ``stop``: end the flight of one drone, or of all, from any terminal."""
+"""``skyloop land``, ``return`` and ``stop``: end the flight of one drone, or of all drones, from any terminal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skyloop.extend import Known, connect_to_stop, let_go
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-FRESH_S: Final = 1.0  #: maximum age of a state that can be trusted
+FRESH_S: Final = 1.0  #: maximum age at which a state can still be trusted
 LANDING_S: Final = 60.0  #: maximum time to wait for a landing
 RETURN_S: Final = 600.0  #: maximum time to wait for a return
 STOPPING_S: Final = 3.0  #: time for which a stop is repeated until the vehicle reports it
@@ -54,10 +54,10 @@ def land(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Land drones, and wait until they have landed.
+    """Land drones and wait until they have landed.
 
-    A drone flown by another application is reported and left alone, unless --priority is higher (a lower number). With
-    --all, every drone lands except those flown with the highest priority. Exit code 1 if a drone has not landed.
+    A drone that another application is flying is reported and left alone, unless --priority is higher (a lower number).
+    With --all, every drone lands except those flown with the highest priority. Exit code 1 if a drone has not landed.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -81,10 +81,10 @@ def return_to_start(
 ) -> None:
     """Fly drones back to their take-off positions, land there, and wait until they have landed.
 
-    Each drone climbs, flies straight to a point above its start and lands; nothing keeps several drones apart on the
-    way. A drone flown by another application is reported and left alone, unless --priority is higher (a lower number).
-    Exit code 1 if a drone has not landed at its start. Such a drone, and every drone after Ctrl-C, hovers and lands 5
-    s later unless someone flies it.
+    Each drone climbs, flies straight to a point above its start and lands; nothing keeps drones apart on the way. A
+    drone flown by another application is reported and left alone, unless --priority is higher (a lower number). Exit
+    code 1 if a drone has not landed at its start. Such a drone, and every drone after Ctrl-C, hovers and lands 5 s
+    later unless someone flies it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -111,9 +111,9 @@ def stop(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Emergency stop: cut the motors at once. The drones FALL.
+    """Emergency stop: cut the motors immediately. The drones FALL.
 
-    It works no matter who is flying and asks first, except with --yes. Exit code 1 if a drone did not confirm.
+    It works no matter who is flying. It asks first, except with --yes. Exit code 1 if a drone did not confirm.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:
@@ -154,9 +154,9 @@ def _each(
     json: bool,
     interrupted: Callable[[], None] = lambda: None,
 ) -> None:
-    """End all flights in parallel. Print a line for each as soon as it has ended, or everything as JSON.
+    """End all flights in parallel. Print a line for each drone as soon as it is done, or everything as JSON.
 
-    ``interrupted`` is called on Ctrl-C and must make each call of ``end`` return or raise.
+    ``interrupted`` is called when Ctrl-C is pressed and must make each call of ``end`` return or raise.
     """
 
     def attempt(name: str) -> Ending:
@@ -164,7 +164,7 @@ def _each(
             return Ending(name, True, end(name))
         except SkyloopError as error:
             return Ending(name, False, f"{failed}: {error_text(error)}")
-        except Exception as error:  # noqa: BLE001  one failure must not hide the other results
+        except Exception as error:  # noqa: BLE001 one failure must not hide the results of others
             return Ending(name, False, f"{failed}: {error!r}")
 
     ended = []
@@ -202,7 +202,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether its pilot is landing it, such as another ``skyloop land``; if so, wait until it has landed."""
+    """Return whether its pilot, such as another ``skyloop land``, is landing it; if so, wait until it has landed."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 
@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover permanently, so that no further return is attempted."""
+    """Hover permanently, so that the return is not attempted again."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 
@@ -234,7 +234,7 @@ def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]
 
 
 def _over_already(name: str, program: str) -> str:
-    """Return why there is no flight to end; empty if there is one."""
+    """Return the reason why there is no flight to end; empty if there is one."""
     from skyloop.client import connect
 
     with connect(name, access="observe", name=program) as seen:
@@ -244,7 +244,7 @@ def _over_already(name: str, program: str) -> str:
 
 
 def _stop(name: str) -> str:
-    """Cut the motors. This needs no authority, and waits only for the connection."""
+    """Cut the motors. This needs no authority and waits only for the connection."""
     from skyloop.messages import FlightState
 
     with closing(connect_to_stop(name, "skyloop stop")) as drone:

@@ -37,7 +37,7 @@ ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 )
 Make = Callable[[type["Controller"]], "Controller"]
-_LOOK_S: Final = 0.1  #: interval between checks that the drone is still there, while waiting for a corrected file
+_LOOK_S: Final = 0.1  #: interval between checks that the drone is still connected, while waiting for a corrected file
 REFRESH_HZ: Final = 4
 LINE_EVERY_S: Final = 5.0  #: used if standard error is not a terminal
 
@@ -53,7 +53,7 @@ def fly(
     ],
     name: naming.OptionalNameArgument = None,
     drone: naming.DroneOption = None,
-    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # a former name
+    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # a former name of this option
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
@@ -67,11 +67,11 @@ def fly(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Take off, run a controller, land. Without NAME a simulated drone flies.
+    """Take off, run a controller and land. Without NAME a simulated drone flies.
 
-    If FILE is the word follow, it follows a person, a car or the target in a box: see skyloop fly follow --help.
+    If FILE is the word follow, this follows a person, a car or the target in a box: see skyloop fly follow --help.
 
-    A line on standard error shows the progress; in a pipe, a new one every 5 seconds.
+    Progress is shown as a line on standard error; in a pipe, as a new line every 5 seconds.
 
     Ctrl-C also lands the drone, as does an error in the controller without --reload.
     """
@@ -81,7 +81,7 @@ def fly(
 
     naming.join_network(network, keys)
     target = naming.one_drone(name, drone or on, default="sim://")
-    if reload:  # otherwise a module saved twice within a second would be loaded from Python's cache
+    if reload:  # otherwise a module saved twice within a second would be loaded from Python's bytecode cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
     reloader = Reloader(file, class_name) if reload else None
@@ -134,10 +134,10 @@ def run(
         seconds: The duration; if None, run until the controller ends or Ctrl-C is pressed.
         reloader: Reloads the controller's file; if None, it is never reloaded.
         takeoff: Whether to take off from the ground.
-        progress: Shows the progress; if None, the default display for flights does.
+        progress: A function that shows the progress, or None for the default progress display of flights.
 
     Returns:
-        Whether the flight ended as intended. Errors during take-off are raised; those in the controller are shown.
+        Whether the flight ended as intended. Errors during take-off are raised; errors in the controller are shown.
     """
     progress = progress or FlightProgress(drone)
     try:
@@ -156,7 +156,7 @@ def run(
 
 
 def land(drone: Drone) -> None:
-    """End the flight: land if in the air and under our control. A second interrupt leaves that to the proxy."""
+    """End the flight: land if in the air and under our control. On a second interrupt, landing is left to the proxy."""
     try:
         problem = end_flight(drone, say)
     except KeyboardInterrupt:
@@ -172,7 +172,7 @@ def say(text: str) -> None:
 
 
 class Flight:
-    """Runs a connected drone's controller to its end, and replaces it whenever the file is saved. Use only once."""
+    """Runs a connected drone's controller until it ends, and reloads it whenever the file is saved. Use only once."""
 
     def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
         self._drone = drone
@@ -180,7 +180,7 @@ class Flight:
         self._report = report
 
     def run(self, seconds: float | None) -> bool:
-        """Run the controller for this long, or until it ends. After an error, hover and return False."""
+        """Run the controller for this duration, or until it ends. After an error, hover and return False."""
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -191,7 +191,7 @@ class Flight:
         return True
 
     def report_notes(self) -> None:
-        """Report probable mistakes in a run that ended without a summary."""
+        """Report likely mistakes in a run that ended without a summary."""
         checks = self._controller._checks
         for note in () if checks is None else checks.notes():
             self._report(f"note: {note}")
@@ -204,7 +204,7 @@ class Flight:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
-                self._cancel(Known(self._drone).listeners)  # otherwise they would continue to fly
+                self._cancel(Known(self._drone).listeners)  # otherwise the old callbacks would keep flying the drone
                 let_go(self._drone, "the controller failed")
                 self._report(what_failed(error))
                 self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
@@ -218,7 +218,7 @@ class Flight:
                 self._report("the saved file is not used: the previous one keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
-        """Hover until a usable file is saved; return False if the time ends or the drone is gone first."""
+        """Hover until a usable file is saved; return False if time runs out or the drone disconnects first."""
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False
@@ -250,9 +250,9 @@ class Flight:
 
 
 def what_failed(error: Exception) -> str:
-    """Return what the user needs to fix an error: their own line, then the traceback without Skyloop's lines.
+    """Return what the user needs to fix an error: their own line, then the traceback without lines from Skyloop.
 
-    An error that Skyloop raised deliberately and outside the user's code becomes one line; others are shown in full.
+    An error that Skyloop raised deliberately outside the user's code becomes one line; others are shown in full.
     """
     home = str(Path(__file__).parents[1])
     trace = traceback.TracebackException.from_exception(error)
@@ -269,7 +269,7 @@ def what_failed(error: Exception) -> str:
 
 
 def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
-    """Return the innermost line outside Skyloop and libraries, or, if there is none, the innermost outside Skyloop."""
+    """Return the innermost line outside Skyloop and libraries or, if there is none, the innermost outside Skyloop."""
     theirs = [line for line in stack if not line.filename.startswith(home)]
     libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
     return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])
@@ -280,7 +280,7 @@ class FlightProgress:
 
     Args:
         drone: The drone.
-        live: Whether to update one line in place; if None, only if standard error is a terminal.
+        live: Whether to update one line in place; if None, do so only if standard error is a terminal.
         what: Returns the state of the flight, shown at the beginning of the line.
         every_s: Interval between lines if standard error is not a terminal; if None, :data:`LINE_EVERY_S`.
     """
@@ -310,7 +310,7 @@ class FlightProgress:
                 console=Console(stderr=True),
                 refresh_per_second=REFRESH_HZ,
                 transient=True,
-                redirect_stdout=sys.stdout.isatty(),  # so that the controller's output appears above the line
+                redirect_stdout=sys.stdout.isatty(),  # makes the controller's output appear above the line
             )
 
     def line(self) -> str:
@@ -408,11 +408,11 @@ def fly_follow(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Take off, follow a target with the camera, land. Without NAME a simulated drone follows a person in a park.
+    """Take off, follow a target with the camera, and land. Without NAME, a simulated drone follows a person in a park.
 
-    Give --class, --box, or both. It does not see walls and trees: fly it where there are none.
+    Give --class, --box, or both. The drone does not see walls and trees: fly it where there are none.
 
-    A line each second on standard error shows the progress. Ctrl-C lands. Exit code 1 if the target was lost for good.
+    Progress is printed on standard error each second. Ctrl-C lands. Exit code 1 if the target is lost for good.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -493,7 +493,7 @@ def _check_class(detector: OnnxDetector, class_name: str | None, where: str) -> 
 
 
 def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDetector | str | None) -> None:
-    """Refuse, while still on the ground, anything that would end the flight in the air."""
+    """Refuse, while the drone is still on the ground, anything that would end the flight in the air."""
     from skyloop.vision.tracking import checked_box
 
     if box is not None:
@@ -509,7 +509,7 @@ def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDete
 
 
 def status_line(pilot: FollowTarget) -> str:
-    """Return the state of following in one line: the target's phase, its position, and how certain it is."""
+    """Return the follower's state in one line: the target's phase, its position, and how certain the position is."""
     status = pilot.status
     parts = [
         status.phase,

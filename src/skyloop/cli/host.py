@@ -1,4 +1,4 @@
-"""``skyloop proxy`` serves one vehicle as a node; ``skyloop host`` serves many from one process."""
+"""``skyloop proxy`` serves one vehicle as a node; ``skyloop host`` serves many vehicles from one process."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def proxy(
 ) -> None:
     """Serve one vehicle to applications until Ctrl-C is pressed, and land it before exiting.
 
-    Serves applications on this host and, with --network, on others too.
+    Serves applications on this host and, with --network, on other hosts too.
     """
     from skyloop.child_process import handed_over
     from skyloop.drivers.uri import parse_uri
@@ -71,7 +71,7 @@ def proxy(
 def host(fleet: FleetArgument, group: GroupOption = None, metrics: net.MetricsOption = None) -> None:
     """Serve all vehicles listed in a file from one process until Ctrl-C is pressed, and land them before exiting.
 
-    skyloop host status, add and remove show and change its vehicles while it runs; each has its own --help.
+    skyloop host status, add and remove show and change its vehicles while it is running; each has its own --help.
     """
     from skyloop.host.fleet import read_fleet
     from skyloop.host.serve import serve
@@ -86,7 +86,7 @@ def status(
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Show the vehicles of a running host: their states, their pilots, and why one failed."""
+    """Show the vehicles of a running host: their states, their pilots, and the reason for any failure."""
     from skyloop.host.serve import Status
 
     rows = _ask(Status(), host, group).vehicles
@@ -109,9 +109,9 @@ def add(
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Add vehicles to a running host: one by its address, all in a file, or one from the host's own file.
+    """Add vehicles to a running host: one by its address, all vehicles in a file, or one from the host's own file.
 
-    A vehicle given by address gets the defaults of the host's file. Vehicles already running are not touched.
+    A vehicle given by address uses the defaults of the host's file. Vehicles that are already running are not affected.
     """
     from skyloop.host.fleet import read_fleet
     from skyloop.host.serve import Add, AddNamed
@@ -135,9 +135,9 @@ def remove(
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Land a vehicle of a running host, and stop serving it.
+    """Land a vehicle of a running host and stop serving it.
 
-    This is refused while the vehicle flies under an application's authority, unless --land is given.
+    The request is refused while the vehicle flies under an application's authority, unless --land is given.
     """
     from skyloop.host.serve import Remove
 
@@ -146,7 +146,7 @@ def remove(
 
 
 def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
-    """Return the rows as a text table. The reason comes last, because it may be long."""
+    """Return the rows as a text table. The reason comes last because it may be long."""
     if not rows:
         return ["This host has no vehicle. Add one: skyloop host add NAME ADDRESS"]
     cells = [("NAME", "ADDRESS", "PROXY", "PROCESS", "STATE", "LINK", "BATTERY", "PILOT", "UP", "WHY")]

@@ -1,7 +1,7 @@
 """``skyloop install``: installs optional parts into this environment, and reports missing ones.
 
-No single way of naming an extra to pip works for a checkout, a wheel and a release. The requirements are therefore read
-from the package's own metadata, which all three have.
+There is no single way to name an extra to pip that works for a checkout, a wheel and a release. The requirements are
+therefore read from the package's own metadata, which all three of them have.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def install(
 ) -> None:
     """Install optional parts of Skyloop into the Python environment that runs this command.
 
-    skyloop doctor shows all parts, and which of them are missing.
+    skyloop doctor lists all parts and says which of them are missing.
     """
     wanted = requirements(parts)
     if dry_run:
@@ -67,8 +67,8 @@ def install(
 def requirements(parts: Iterable[str]) -> list[str]:
     """Return the requirements of optional parts in pip's syntax.
 
-    Raise ``UnknownNameError`` if there is no part with this name, or ``SkyloopError`` if Skyloop's own metadata is
-    missing, because it runs from a folder without having been installed.
+    Raise ``UnknownNameError`` if there is no part with this name, and ``SkyloopError`` if Skyloop's own metadata is
+    missing because Skyloop runs from a folder without having been installed.
     """
     table: dict[str, list[str]] = {}
     for line in _metadata():
@@ -94,7 +94,7 @@ def _metadata() -> list[str]:
 
 
 def _installer(anew: bool) -> list[str]:
-    """Return the command that installs packages into this environment: its pip or, if there is none, uv."""
+    """Return the command that installs packages into this environment: the environment's pip or, if it has none, uv."""
     if importlib.util.find_spec("pip"):
         return [sys.executable, "-m", "pip", "install", *(["--force-reinstall"] if anew else [])]
     if shutil.which("uv"):
@@ -118,6 +118,6 @@ def _is_there(module: str) -> bool:
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Extend an error about one missing part, so that it names all those of ``parts`` that are missing."""
+    """Extend an error about one missing part so that it names all of ``parts`` that are missing."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

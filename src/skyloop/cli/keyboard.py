@@ -1,7 +1,7 @@
 """Convert a terminal's keys to a pilot's stick positions and commands; :class:`Hands` and :class:`Tokenizer` are pure.
 
 A terminal reports presses and repeats, but never releases. A press therefore moves its stick for :data:`HOLD_S`, which
-is longer than terminals wait before they repeat a key; repeats keep the stick there.
+is longer than the delay after which terminals repeat a key; repeats hold the stick there.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.files import wait_readable
 from skyloop.messages import FlightState
 
-HOLD_S: Final = 0.6  #: how long a press moves its stick
-TWICE_S: Final = 1.0  #: two presses of Esc within this time cut the motors
-REPEAT_S: Final = 0.12  #: a held key repeats faster than this, and no finger can
-DELAY_S: Final = 0.2  #: no keyboard starts repeating sooner
-SAME_S: Final = 0.04  #: a second Esc this close to the keyboard's delay may be a repeat of the first
-LANDING_S: Final = 3.0  #: sticks are blocked for this long after L, because the vehicle may not report its landing yet
-STOPPING_S: Final = 2.0  #: nothing else is requested for this long after a stop, unless the vehicle already reports it
+HOLD_S: Final = 0.6  #: how long a key press moves its stick
+TWICE_S: Final = 1.0  #: pressing Esc twice within this time cuts the motors
+REPEAT_S: Final = 0.12  #: a held key repeats faster than this, but no finger does
+DELAY_S: Final = 0.2  #: all keyboards wait at least this long before a key repeats
+SAME_S: Final = 0.04  #: a second Esc whose delay is this close to the keyboard's delay may be a repeat of the first
+LANDING_S: Final = 3.0  #: sticks are blocked for this long after L; the vehicle may not have reported landing yet
+STOPPING_S: Final = 2.0  #: after a stop, nothing else is requested for this long, unless the vehicle reports the stop
 _ESC_ALONE_S: Final = 0.03  #: the remaining bytes of an arrow key arrive within this time after its Esc
 _LONGEST: Final = 32  # maximum length of a sequence in bytes
 
@@ -38,9 +38,9 @@ Order = Literal[
     "faster",
     "slower",
     "quit",
-    "centre",  #: the sticks were released
-    "held",  #: Esc is being held, which does not count as a second press
-    "grounded",  #: a stick was moved on the ground
+    "centre",  #: the sticks have been released
+    "held",  #: Esc is being held down, which does not count as a second press
+    "grounded",  #: a stick was moved while the drone was on the ground
 ]
 Axis = Literal["forward", "left", "up", "yaw_rate"]
 
@@ -65,7 +65,7 @@ ORDERS: Final[dict[str, Order]] = {
     "-": "slower",
     "q": "quit",
 }
-#: The keys and their meanings, for users; the same as in the cockpit.
+#: The keys and their meanings, as shown to users; they are the same as in the cockpit.
 KEY_MAP: Final = (
     ("Esc Esc", "motors off, at once; the first Esc hovers"),
     ("T", "take off"),
@@ -108,23 +108,23 @@ class Hands:
     def __init__(self) -> None:
         self._stepped_s = -math.inf  # time of the last step
         self._pressed: dict[Axis, tuple[int, float]] = {}
-        self._held_over: dict[str, float] = {}  # stick keys held during a landing, and when they last repeated
+        self._held_over: dict[str, float] = {}  # stick keys held during a landing, and the times of their last repeats
         self._moving = False  # whether the last step moved a stick
-        self._landed_s = -math.inf  # time of the last L
+        self._landed_s = -math.inf  # time of the last press of L
         self._stopped_s = -math.inf  # time of the last stop
-        self._escaped_s = -math.inf  # time of the last Esc, unless another key followed
-        self._second: tuple[float, float] | None = None  # a second Esc: its time, and the time since the first
+        self._escaped_s = -math.inf  # time of the last Esc, unless another key has followed
+        self._second: tuple[float, float] | None = None  # the second Esc: its time, and the time since the first one
         self._repeats = False  # whether Esc is being held
-        self._doubtful = False  # whether the last Esc may have been either a press or the first repeat of a held key
-        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; infinite until it is known
-        self._newest = "", -math.inf, math.inf  # the last key, its time, and the time since the same key's last press
-        self.no_effect = ""  #: why a key in the last step had no effect, for users; empty if all keys had one
+        self._doubtful = False  # whether the last Esc may have been a press or the first repeat of a held key
+        self._delay_s = math.inf  # the keyboard's delay before it repeats a held key; infinite while unknown
+        self._newest = "", -math.inf, math.inf  # the last key, when it was pressed, and the time since the press before
+        self.no_effect = ""  #: why a key had no effect in the last step, for users; empty if all had one
 
     def step(self, keys: Sequence[str], now_s: float, state: FlightState) -> list[Order | Deflection]:
-        """Return the commands in sequence. If a stick is moved, the positions of the sticks come last."""
+        """Return the commands in order. If a stick is moved, the positions of the sticks are the last item."""
         wanted: list[Order | Deflection] = []
         self.no_effect = ""
-        stalled = now_s - self._stepped_s > REPEAT_S  # keys may have queued up, so their times are meaningless
+        stalled = now_s - self._stepped_s > REPEAT_S  # several keys may have queued up, so their timing means nothing
         self._stepped_s = now_s
         repeats = stalled and bool(keys) and keys[0] == "esc"
         if self._second is not None and now_s - self._second[0] >= REPEAT_S and not repeats:
@@ -158,14 +158,14 @@ class Hands:
     def _press(self, key: str, now_s: float, state: FlightState) -> Order | None:
         second, self._second, self._escaped_s = self._second, None, -math.inf
         if second is not None and second[1] < DELAY_S:
-            return self._stop(now_s)  # too early for a repeat: the key was pressed twice
+            return self._stop(now_s)  # this is too early for a repeat: the key was pressed twice
         key = key.lower()
         order = "hover" if key == "alt" else ORDERS.get(key)
         if order == "quit":
             return order
         if now_s - self._stopped_s < STOPPING_S and state is not FlightState.EMERGENCY:
             self.no_effect = f"{_shown(key)} has no effect while the motors are being stopped"
-            return None  # no command may replace a stop that the vehicle has not reported yet
+            return None  # a stop that the vehicle has not reported yet must not be replaced by any command
         if key not in STICKS:
             if order is None:
                 self.no_effect = f"{_shown(key)} has no function here"
@@ -176,7 +176,7 @@ class Hands:
             self.no_effect = (
                 f"{_shown(key)} has no effect during a landing; release it, end the landing with H, and press it again"
             )
-            self._held_over[key] = now_s  # only H ends a landing, not sticks or keys held meanwhile
+            self._held_over[key] = now_s  # only H ends a landing; sticks or keys held meanwhile do not
         else:
             self._pressed[axis] = (sign, now_s)
         return None
@@ -190,7 +190,7 @@ class Hands:
             first, self._second, self._repeats, self._doubtful = not self._repeats, None, True, False
             return "held" if first else None
         if self._doubtful and gap_s <= TWICE_S and not stalled:
-            return self._stop(now_s)  # too late for a repeat: a new press, whatever the last Esc was
+            return self._stop(now_s)  # too late for a repeat: a new press, whatever the last Esc meant
         if gap_s > TWICE_S or self._repeats:
             self._repeats = self._doubtful = False
             return "hover"
@@ -211,25 +211,25 @@ class Hands:
 
 
 def _shown(key: str) -> str:
-    """Return a key as printed on keyboards, or the bytes that it sends."""
+    """Return a key's printed label, or the bytes that the key sends."""
     return _NAMES.get(key) or (key.upper() if key.isprintable() else repr(key))
 
 
 class Tokenizer:
     """Converts a terminal's bytes to keys: letters, ``up`` … for arrows, ``esc``, and ``alt`` for Alt with any key.
 
-    A terminal sends Alt with a key as Esc followed by that key, exactly like Esc pressed just before the key. Therefore
-    ``alt`` hovers, but does not count as Esc.
+    A terminal sends Alt plus a key as Esc followed by that key, exactly as if Esc had been pressed just before the key.
+    Therefore, ``alt`` makes the drone hover but does not count as Esc.
     """
 
     def __init__(self) -> None:
         self._rest = b""
         self._alone = False  # whether the last Esc was treated as a separate key
-        self.other = ""  #: a notice for users about other input in the last bytes; may be empty
+        self.other = ""  #: a notice for users about other input in the newest bytes; may be empty
 
     @property
     def waits(self) -> bool:
-        """Whether a sequence has begun but not ended."""
+        """Whether a key sequence has begun but not ended."""
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[str]:
@@ -266,17 +266,17 @@ class Tokenizer:
         return keys
 
     def flush(self) -> list[str]:
-        """Return the keys of an unfinished sequence of which no more bytes have arrived."""
+        """Return the keys of an unfinished sequence after which no more bytes have arrived."""
         rest, self._rest, self.other = self._rest, b"", ""
         self._alone = rest == b"\x1b"
         return ["esc"] * len(rest) if not rest.strip(b"\x1b") else ["alt"]
 
 
 class Keyboard:
-    """Reads the terminal's keys one by one, without Enter; a context manager that restores the terminal.
+    """Reads the terminal's keys one at a time, without Enter; a context manager that restores the terminal.
 
-    Raise ``UsageError`` if standard input is not a terminal, or ``UnsupportedError`` if this platform's terminals can't
-    report single keys.
+    Raise ``UsageError`` if standard input is not a terminal, and ``UnsupportedError`` if this platform's terminals
+    can't report single keys.
     """
 
     def __init__(self) -> None:
@@ -300,7 +300,7 @@ class Keyboard:
         self._set_mode()
         self._continued = signal.signal(
             signal.SIGCONT, lambda *_: self._set_mode()
-        )  # while suspended, a shell has set its own mode
+        )  # while the process was suspended, the shell may have set its own mode
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -320,11 +320,11 @@ class Keyboard:
 
     @property
     def other(self) -> str:
-        """A notice for users about other input just read; may be empty."""
+        """A notice for users about other input that was just read; may be empty."""
         return self._tokens.other
 
     def keys(self, within_s: float) -> list[str]:
-        """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal is gone."""
+        """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal has been closed."""
         if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)

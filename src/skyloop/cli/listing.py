@@ -43,8 +43,8 @@ class Row(msgspec.Struct, frozen=True):
     owner: str | None = None
     vehicle_link: str = ""
     problem: str = ""
-    link_reason: str = ""  #: why the vehicle's link is not up
-    link_remedy: str = ""  #: how to fix it
+    link_reason: str = ""  #: reason why the vehicle's link is not up
+    link_remedy: str = ""  #: advice on how to fix the link
 
 
 def list_proxies(
@@ -52,9 +52,9 @@ def list_proxies(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show the running proxies, their hosts, vehicles and states, and the holders of the authority.
+    """Show the running proxies, their hosts, vehicles and states, and who holds authority.
 
-    Lists this host's proxies, and with --network those reachable over the network.
+    Lists this host's proxies and, with --network, those that can be reached over the network.
     """
     from skyloop.network.config import choose
 
@@ -72,7 +72,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return a message that no proxy was found here or on the network, and whose proxies run here."""
+    """Return a message that says that no proxy was found here or on the network, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
@@ -80,7 +80,7 @@ def none_runs(settings: FabricSettings | None) -> str:
 
 
 def of_others() -> str:
-    """Return text saying which proxies other users run on this host; empty if there are none."""
+    """Return a text that says which proxies other users run on this host, or an empty text if there are none."""
     from skyloop.transport.local import names_of_others
 
     theirs = [f"{user} runs {', '.join(sorted(names))}" for user, names in sorted(names_of_others().items())]
@@ -92,7 +92,7 @@ def of_others() -> str:
 def running(settings: FabricSettings | None = None) -> list[Row]:
     """Return all proxies on this host and, with settings, on the network, by name.
 
-    They are queried in parallel, so suspended ones delay the list only once.
+    They are queried in parallel, so suspended proxies delay the list only once.
     """
     from skyloop.transport.local import list_names
 
@@ -109,7 +109,7 @@ def running(settings: FabricSettings | None = None) -> list[Row]:
 
 
 def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
-    """Group the rows by process, because a process describes all its vehicles in one overview."""
+    """Group the rows by process, because each process describes all of its vehicles in one overview."""
     found: dict[tuple[object, ...], list[Row]] = {}
     for row in rows:
         found.setdefault((row.host, row.pid) if row.pid else (row.host, row.name), []).append(row)
@@ -117,14 +117,14 @@ def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
 
 
 def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
-    """Return the reports of a process's proxies, several over one connection if possible."""
+    """Return the reports of a process's proxies; query several of them over one connection if possible."""
     overview: dict[str, VehicleOverview] = {}
     if len(rows) > 1:
         try:
             with observed(rows[0], settings) as drone:
                 overview = {vehicle.name: vehicle for vehicle in drone.overview().vehicles}
         except SkyloopError:
-            pass  # each is queried separately
+            pass  # each proxy is then queried separately
     return [
         with_state(row, seen.vehicle, seen.uri, seen) if (seen := overview.get(row.name)) else described(row, settings)
         for row in rows
@@ -132,7 +132,7 @@ def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
 
 
 def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOverview) -> Row:
-    """Return the row completed with the proxy's report on the vehicle."""
+    """Return the row, completed with the proxy's report on the vehicle."""
     return msgspec.structs.replace(
         row,
         vehicle=vehicle,
@@ -147,7 +147,7 @@ def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOvervie
 
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
-    """Merge these proxies with those on the network. A proxy reached both ways gets one row."""
+    """Merge these proxies with those on the network. A proxy that can be reached both ways gets one row."""
     from skyloop.network import list_proxies as far
 
     rows = {(row.host, row.pid, row.name): row for row in near}
@@ -166,7 +166,7 @@ def describe(name: str) -> Row:
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
-    """Return a proxy's description of itself or, if it does not answer, the reason."""
+    """Return a proxy's description of itself, or the reason why it does not answer."""
     try:
         with observed(row, settings) as drone:
             return with_state(row, drone.capabilities.vehicle, drone.uri, drone.feedback())
@@ -175,7 +175,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer with this name, over the transport in its row."""
+    """Connect to a proxy as an observer with the given name, over the transport listed in the proxy's row."""
     from skyloop.client import connect
 
     far = "local" not in row.transport
@@ -189,7 +189,7 @@ def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop lis
 
 
 def lines(rows: Iterable[Row]) -> list[str]:
-    """Return the rows as a text table. The address comes last, because it may be long."""
+    """Return the rows as a text table. The address comes last because it may be long."""
     cells = [("NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
     cells += [
         (
@@ -218,7 +218,7 @@ def audit(
     last: Annotated[int | None, typer.Option(metavar="N", min=1, help="Only the last N")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
-    """Show who held the authority over a drone, from when to when, and how it ended. Times are local."""
+    """Show who held authority over a drone, from when to when, and how it ended. Times are in local time."""
     from skyloop.proxy.records import read, tenures
 
     name = one_drone(name, drone) if name is not None or drone is not None else None

@@ -50,7 +50,7 @@ class Form(StrEnum):
 
 
 class Which(StrEnum):
-    """Whether to compare commands before or after the proxy's limits."""
+    """Whether to compare commands before or after the proxy has limited them."""
 
     ASKED = "asked"
     APPLIED = "applied"
@@ -58,9 +58,9 @@ class Which(StrEnum):
 
 @log.callback()
 def _log() -> None:
-    """Inspect recordings: contents, reports, exports, comparisons; and repair them.
+    """Inspect recordings: contents, reports, exports and comparisons; and repair them.
 
-    skyloop log COMMAND --help describes each.
+    skyloop log COMMAND --help describes each command.
     """
 
 
@@ -69,7 +69,7 @@ def info(
     file: File,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems with the file."""
+    """Show channels with counts, rates, gaps, missing samples and delays; also drops, and problems with the file."""
     from skyloop.recording.review.summary import summarise
 
     recording = _open(file)
@@ -116,7 +116,7 @@ def report(
     drone: DroneName = None,
     pictures: Annotated[int, typer.Option(min=0, max=48, help="Number of key frames of each camera")] = 8,
 ) -> None:
-    """Write one self-contained HTML page: path, attitude with set-points, battery, events, delays, key frames."""
+    """Write one self-contained HTML page: path, attitude with set-points, battery, events, delays and key frames."""
     from skyloop.recording.review.report import write_report
 
     recording = _open(file)
@@ -152,11 +152,11 @@ def export(
     fps: Annotated[float | None, typer.Option(help="For lerobot: rows per second [default: 10]")] = None,
     task: Annotated[str | None, typer.Option(help="For lerobot: description of the task")] = None,
 ) -> None:
-    """Write the samples as tables, a camera's frames as a video, flights as training data, or everything for Rerun.
+    """Write the samples as tables, a camera's frames as a video, flights as training data, or all of it for Rerun.
 
-    H.264 is copied as recorded, which takes seconds, unless the time is drawn on the frames. For lerobot, flights
-    become episodes of a LeRobotDataset: pictures, the state when each was captured, and the commands. rrd is a file for
-    Rerun's viewer, with all drones. Foxglove and Lichtblick can open the recording directly.
+    H.264 is copied as recorded, which takes only seconds, unless the time is drawn on the frames. For lerobot, flights
+    become episodes of a LeRobotDataset: pictures, the state at the capture of each picture, and the commands. rrd is a
+    file for Rerun's viewer that contains all drones. Foxglove and Lichtblick can open the recording directly.
     """
     from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4
@@ -219,7 +219,7 @@ def compare(
     part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Compare the commands of an old and a changed controller: RMS of each set-point, and where they diverge."""
+    """Compare the commands of an old and a changed controller: RMS of each set-point, and where the two diverge."""
     from skyloop.recording.review.compare import compare as commands_of
 
     if output is not None and output.suffix not in (".html", ".png"):
@@ -248,7 +248,7 @@ def recover(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Write the readable part of a cut or damaged recording to a new file with an index. The old file is kept."""
+    """Write the readable part of a damaged recording to a new file with an index. The original file is kept."""
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
@@ -321,7 +321,7 @@ def _open(file: Path) -> Recording:
 
 
 def _file(output: Path | None, name: str, beside: Path) -> Path:
-    """Return the file to write: inside a folder if one is given, otherwise with the right suffix."""
+    """Return the path of the file to write: inside the folder if a folder is given, otherwise with the right suffix."""
     if output is None:
         return beside.with_name(name)
     return output / name if output.is_dir() else output.with_suffix(output.suffix or Path(name).suffix)
@@ -355,7 +355,7 @@ def _refuse(given: dict[str, bool], to: Form) -> None:
 
 
 def info_parts(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
-    """Yield the output of ``skyloop log info``."""
+    """Yield the lines printed by ``skyloop log info``."""
     yield _head(recording, summary)
     yield _channel_table(summary)
     for words in _losses(summary):
@@ -400,7 +400,7 @@ def _head(recording: Recording, summary: Summary) -> Table:
 
 def _channel_table(summary: Summary) -> Table:
     table = Table(box=None)
-    table.add_column("topic", overflow="fold")  # never cut, because it identifies the rows
+    table.add_column("topic", overflow="fold")  # never truncated, because it identifies the rows
     for title in ("count", "rate", "gaps", "longest", "missing", "size"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("delay [ms]: median (p99)")
@@ -439,7 +439,7 @@ def _losses(summary: Summary) -> Iterator[str]:
 
 
 def _exported(found: Videos, camera: str) -> Iterator[str]:
-    """Yield a line for each exported video, and one about missing frames."""
+    """Yield a line for each exported video, and a line about missing frames."""
     for video in found.videos:
         since = f", from {video.begin_s:.3f} s on" if video is not found.videos[0] else ""
         how = "as it was recorded" if video.copied else "encoded"

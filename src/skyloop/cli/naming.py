@@ -1,4 +1,4 @@
-"""Options that name drones and the network, with the same words, help and completion in every command.
+"""Options that name drones and the network, with the same names, help and completion in every command.
 
 A drone is given as NAME; ``--drone NAME`` means the same everywhere. The network is given as ``--network WHERE``.
 """
@@ -59,7 +59,7 @@ def python_files(incomplete: str) -> list[str]:
 
 
 def files_ending(incomplete: str, endings: Iterable[str]) -> list[str]:
-    """Return folders, and files with these suffixes, whose names begin with the text typed."""
+    """Return folders, and files with these suffixes, whose names begin with the typed text."""
     folder, _, start = incomplete.rpartition("/")
     wanted, found = set(endings), []
     with suppress(OSError):
@@ -117,7 +117,7 @@ SecondsOption = Annotated[
 
 
 def keys_directory() -> Path:
-    """Return the folder of this user's lab."""
+    """Return the folder of the current user's lab."""
     import platformdirs
 
     return platformdirs.user_config_path("skyloop", appauthor=False) / "keys"
@@ -138,9 +138,9 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 
 
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
-    """Return the drones that a command is for, each once: those given as NAME first, then those given as ``--drone``.
+    """Return the drones that a command is for, each once: first those given as NAME, then those given as ``--drone``.
 
-    Raise ``UsageError`` if no drone is given, but one is required.
+    Raise ``UsageError`` if no drone is given although one is required.
     """
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
@@ -154,22 +154,22 @@ def _running() -> str:
 
 
 def join_network(network: str | None, keys: Path | None) -> None:
-    """Search the network given by the options, in this process and its children.
+    """Search the network that the options specify, in this process and its children.
 
-    Raise ``UsageError`` if an address or the folder is invalid, or keys are given without a network.
+    Raise ``UsageError`` if an address or the folder is invalid, or if keys are given without a network.
     """
     if network is None and keys is None:
         return
     from skyloop.network.config import choose
 
-    choose(network, keys)  # raises if values are invalid
+    choose(network, keys)  # raises an error if values are invalid
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
         if value is not None:
             os.environ[variable] = str(value)
 
 
 def with_place(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with ``multicast`` inserted after any ``--network`` without a place."""
+    """Return the arguments with ``multicast`` inserted after each ``--network`` that has no value."""
     words: list[str] = []
     for index, word in enumerate(arguments):
         words.append(word)

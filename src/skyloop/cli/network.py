@@ -1,6 +1,6 @@
 """The network: options shared by commands that serve vehicles; the commands ``skyloop router`` and ``skyloop keys``.
 
-``skyloop keys`` determines who may join a lab's network, and with which rights.
+``skyloop keys`` determines who may join a lab's network, and with which permissions.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ ListenOption = Annotated[
     list[str] | None,
     typer.Option(metavar="ADDR", help="Network: address to listen on, e.g. 10.0.0.5:7447 [all, any free port]"),
 ]
-#: The former option for routers, from before ``--network`` accepted their addresses.
+#: The former option for routers, used before ``--network`` accepted their addresses.
 ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
     bool,
@@ -75,9 +75,9 @@ def settings_of(
     multicast: bool,
     keys: Path | None,
 ) -> FabricSettings | None:
-    """Return the settings given by the options, or None to stay on this host.
+    """Return the settings specified by the options, or None to stay on this host.
 
-    Raise ``UsageError`` if an option needs ``--network``, or is invalid.
+    Raise ``UsageError`` if an option requires ``--network``, or is invalid.
     """
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
@@ -91,9 +91,9 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return the settings of a network given as the value of ``--network`` and the related options.
+    """Return a network's settings from the value of ``--network`` and the related options.
 
-    Raise ``UsageError`` if an address or the folder is invalid, or no place is given.
+    Raise ``UsageError`` if an address or the folder is invalid, or if no place is given.
     """
     from skyloop.network.config import serving
 
@@ -101,7 +101,7 @@ def places(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return a factory for a proxy's transport server, for this host, optionally a group, and the network if set."""
+    """Return a factory for a proxy's transport server: on this host, optionally in a group and on the network."""
     from skyloop.transport.local import LocalServer
 
     if settings is None:
@@ -112,12 +112,12 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
 
 
 def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
-    """Return a function that reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
+    """Return a function that reports changes of the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
     return None if settings is None or settings.ring is None else settings.ring.poll
 
 
 def metrics_beside(where: str | None) -> Beside | None:
-    """Return the metrics server to run along with a process's proxies; None without ``--metrics``.
+    """Return the metrics server to run alongside a process's proxies, or None without ``--metrics``.
 
     Raise ``UsageError`` if ``where`` is not an address.
     """
@@ -127,11 +127,11 @@ def metrics_beside(where: str | None) -> Beside | None:
     from skyloop.metrics.endpoint import parse_where
 
     parse_where(where)
-    return serving_beside(where, tell)  # on standard error: programs read the proxies' lines on standard output
+    return serving_beside(where, tell)  # on standard error, because programs read the proxies' lines on standard output
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
-    """Warn each time, in plain words, about a network without keys."""
+    """Warn each time, in plain words, if the network has no keys."""
     if settings is not None and settings.tls is None:
         typer.echo(
             OPEN.format(names=" and ".join(names) if len(names) < 4 else f"these {len(names)} vehicles"), err=True
@@ -139,10 +139,10 @@ def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
 
 
 def settle(options: SimOptions) -> None:
-    """Make room in this process for the threads that relay commands, next to those that step and draw.
+    """Make room in this process for the threads that relay commands, alongside those that step and draw.
 
-    The GIL is released after one millisecond instead of five, and OpenCV uses one core. Do not call this in the user's
-    process.
+    The GIL is released after one millisecond instead of five, and OpenCV is limited to one core. Do not call this in a
+    user's process.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:
@@ -178,9 +178,9 @@ def router(
         typer.Option("--print-config", help="Only print the configuration, for Zenoh's own router: zenohd -c FILE"),
     ] = False,
 ) -> None:
-    """Relay between proxies and applications of several networks, until Ctrl-C.
+    """Relay between proxies and applications on several networks until Ctrl-C is pressed.
 
-    Each proxy and application connects to a router within reach; routers connect to one another.
+    Each proxy and application connects to a router that it can reach; routers connect to one another.
     """
     from skyloop.network import config
     from skyloop.network.config import Part
@@ -233,9 +233,9 @@ LabOption = Annotated[
 
 @keys.callback()
 def _keys() -> None:
-    """Manage the network's keys: create a lab's authority, issue, show and revoke identities.
+    """Manage the network's keys: create a lab's authority, and issue, show and revoke identities.
 
-    skyloop keys COMMAND --help describes each; docs/security.md sets up a lab in five commands.
+    skyloop keys COMMAND --help describes each command; docs/security.md sets up a lab in five commands.
     """
 
 
@@ -265,7 +265,7 @@ def issue(
     days: Annotated[float, typer.Option(metavar="N", help="Validity")] = 30.0,
     directory: LabOption = None,
 ) -> None:
-    """Create a key and a certificate in a folder for their holder. An old key with that name stays valid."""
+    """Create a key and a certificate in a folder for their holder. An old key with the same name remains valid."""
     from skyloop.network.keys import Lab
     from skyloop.network.keys.identity import make_identity
 
@@ -281,7 +281,7 @@ def show(
     directory: LabOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """List all identities: role, drones, expiry. --dir may also be an identity's folder, to show its copy.
+    """List all identities: role, drones, expiry. --dir may also be an identity's own folder, to show its copy.
 
     Keys that have expired or will expire within a week are also listed on standard error.
     """

@@ -45,8 +45,8 @@ def param(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """List a vehicle's parameters, show one, or write one."""
-    if drone is not None:  # the remaining words are then KEY and VALUE
+    """List a vehicle's parameters, or show or set one of them."""
+    if drone is not None:  # in this case, the remaining words are KEY and VALUE
         if value is not None and name != drone:
             raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
         if name != drone:
@@ -83,7 +83,7 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """Parse a value typed by a person according to the parameter's type.
+    """Parse a value typed by a person, according to the parameter's type.
 
     Raise ``UsageError`` if the value has the wrong type.
     """
@@ -104,18 +104,18 @@ def parse_value(parameter: Parameter, text: str) -> Value:
 
 
 def table(parameters: list[Parameter]) -> list[str]:
-    """Return a line for each parameter: name, value with unit, allowed values. Long values are cut."""
+    """Return a line for each parameter: name, value with unit, and allowed values. Long values are truncated."""
     rows = [(p.name, shorten(f"{show(p.value)} {p.unit}".rstrip()), allowed(p)) for p in parameters]
     return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
 
 
 def shorten(value: str) -> str:
-    """Return a value, shortened to fit into a table."""
+    """Return a value, shortened so that it fits into a table."""
     return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
 def details(parameter: Parameter) -> list[str]:
-    """Return everything known about one parameter."""
+    """Return all information about one parameter."""
     p = parameter
     rows = [
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),
@@ -143,7 +143,7 @@ def allowed(parameter: Parameter) -> str:
 
 
 def show(value: Value) -> str:
-    """Return a value the way a person would type it."""
+    """Return a value as a person would type it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""``skyloop process`` and ``skyloop detect``: run the user's class, or a detector, on a drone's frames."""
+"""``skyloop process`` and ``skyloop detect``: run a user's class, or a detector, on the frames of a drone."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def process(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Process the newest frames of a drone with your own class, and publish its results. Read-only.
+    """Process the newest frames of a drone with your own class, and publish the results. Read-only.
 
     The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
-    arrays; read them with drone.results("NAME") and Controller.on_result. A line each second shows the progress.
+    arrays; read them with drone.results("NAME") and Controller.on_result. Progress is printed as one line per second.
     """
     from skyloop.processing import Settings, load_processor
 
@@ -78,7 +78,7 @@ def process(
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
-        pass  # the normal way to stop
+        pass  # this is the normal way to stop
 
 
 def work(
@@ -112,7 +112,7 @@ def work(
 
 
 def _lines(line: Callable[[], str], ended: threading.Event) -> None:
-    """Print a line each second."""
+    """Print a line every second."""
     for _ in beats(LINE_EVERY_S, ended):
         typer.echo(line())
 
@@ -125,7 +125,7 @@ def _lead(
     seconds: float | None,
     show: Callable[[Status], str],
 ) -> None:
-    """Run several workers, each in its own process, so that none waits for another's GIL."""
+    """Run several workers, each in its own process, so that none has to wait for another worker's GIL."""
     from skyloop.processing.group import Group, child_command
 
     if "://" in drone:
@@ -163,7 +163,7 @@ def show_text(status: Status) -> str:
 
 
 def show_json(status: Status) -> str:
-    """Return a line for programs."""
+    """Return a line of output for programs."""
     return json_text(status)
 
 
@@ -197,11 +197,11 @@ def detect(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Detect people, cars or any class of your network in a drone's frames, and draw them live. Read-only.
+    """Detect people, cars or any class that your network knows in a drone's frames, and draw them live. Read-only.
 
-    Without FILE it finds the simulator's people, cars and crates: person, car, box. For a real camera give a FILE.
-    The results, with their frame's time, are those of a processor: drone.results("detections"). Run the same command
-    again for another worker that shares the frames. A line each second shows the progress.
+    Without FILE, it finds the simulator's people, cars and crates: person, car, box. For a real camera, give FILE. The
+    results carry their frame's time and are published as a processor's results: drone.results("detections"). Run the
+    same command again to start another worker that shares the frames. Progress is printed as one line per second.
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector
@@ -219,14 +219,14 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # the normal way to stop
+    with contextlib.suppress(KeyboardInterrupt):  # this is the normal way to stop
         work(lambda: processor, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
 class DetectionProcessor:
     """Publishes a detector's results: ``{"detections": [{"box": …, "score": …, "class_id": …, "class_name": …}, …]}``.
 
-    Each detection is drawn as a closed outline with four corners, and a text with its class and score.
+    Each detection is drawn as a closed outline with four corners and a label with its class and score.
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
@@ -235,7 +235,7 @@ class DetectionProcessor:
         self._classes = frozenset(classes)
 
     def process(self, frame: Frame) -> Output:
-        """Detect in one frame."""
+        """Detect objects in one frame."""
         found = [one for one in self._detector.detect(frame) if not self._classes or one.class_name in self._classes]
         found = found[:MOST]
         return Output({"detections": [_value(one) for one in found]}, [s for one in found for s in _shapes(one)])

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skyloop.recording.taps import Screen, View
 
 REFRESH_S: Final = 0.25  # used on a terminal
-LINE_EVERY_S: Final = 1.0  # used in a pipe
+LINE_EVERY_S: Final = 1.0  # used if the output is a pipe
 _LOOK_S: Final = 0.5
 
 
@@ -56,9 +56,9 @@ def record(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Record drones to an MCAP file until Ctrl-C. This only observes: others may fly meanwhile.
+    """Record drones to an MCAP file until Ctrl-C. This command only observes: others may fly meanwhile.
 
-    If the output is not a terminal, a line is printed each second.
+    If the output is not a terminal, a line is printed every second.
     """
     from skyloop.recording import record as start
 
@@ -77,7 +77,7 @@ def record(
         in_process=True,
     )
     interrupt_by_signals((signal.SIGTERM,))
-    with recorder, suppress(KeyboardInterrupt):  # the normal way to stop
+    with recorder, suppress(KeyboardInterrupt):  # this is the normal way to stop
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
 
@@ -95,14 +95,14 @@ def _show(recorder: Recorder, seconds: float) -> None:
         line = progress(status, before)
         typer.echo(f"\r\x1b[K{line}" if live else line, nl=not live)
         before = status
-        if status.state.value == "failed":  # it will not recover
+        if status.state.value == "failed":  # the recorder will not recover
             break
     if live:
         typer.echo()
 
 
 def progress(status: Status, before: Status) -> str:
-    """Return the progress in one line; rates are relative to ``before``."""
+    """Return the progress as one line; rates are relative to ``before``."""
     span_s = max(1e-3, status.seconds - before.seconds)
     minutes, seconds = divmod(round(status.seconds), 60)
     parts = [
@@ -162,15 +162,15 @@ def view(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones live in Foxglove or Rerun until Ctrl-C. This only observes: others may fly meanwhile.
+    """Show drones live in Foxglove or Rerun until Ctrl-C is pressed. This only observes: others may fly meanwhile.
 
-    Connect Foxglove to the address shown. A slow or stalled viewer does not slow down anything else.
+    Connect Foxglove to the printed address. A slow or stalled viewer does not slow down anything else.
     """
     _refuse(foxglove, rerun, write, connect, save, port)
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal way to stop
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # this is the normal way to stop
         from skyloop.client import connect as connect_to
         from skyloop.recording.taps import View, give_way
 

@@ -43,10 +43,10 @@ def ros(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones to ROS 2: images, state and transforms as topics; fly by cmd_vel and services. Until Ctrl-C.
+    """Show drones to ROS 2: images, state and transforms as topics; fly with cmd_vel and services. Until Ctrl-C.
 
     Each drone is a namespace, such as /alpha. It is visible only on this machine, unless --subnet or the ROS 2
-    variables say otherwise. Drones flown by this command land when it ends.
+    variables change this. Drones flown by this command land when the command ends.
     """
     from skyloop.ros import Bridge, Settings
     from skyloop.vehicles.ros2.node import domain_of
@@ -69,4 +69,4 @@ def ros(
                 typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
             bridge.run()
     except KeyboardInterrupt:
-        pass  # the normal way to stop
+        pass  # this is the normal way to stop

@@ -33,7 +33,7 @@ def check(
     drone: DroneOption = "sim://",
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON")] = False,
 ) -> None:
-    """Show the problems with a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
+    """Show the problems with a route: legs, heights, speeds, zones and battery. Exit code 1 if it can't be flown."""
     from skyloop.client import connect
     from skyloop.control import load_route
     from skyloop.control.route import check_for

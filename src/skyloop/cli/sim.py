@@ -103,10 +103,10 @@ def sim(
     ] = None,
     fault_seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Firmware: seed of the faults [0]")] = None,
 ) -> None:
-    """Simulate drones that see one another in one world, each with its own proxy, until Ctrl-C.
+    """Simulate drones that see one another in one world until Ctrl-C; each has its own proxy.
 
-    With --autopilot, real ArduCopter, PX4 or Betaflight flies them (docs/autopilots.md). With --firmware, each is
-    instead an emulation of a drone's firmware on the network, for any program that can fly the real one.
+    With --autopilot, the drones are flown by real ArduCopter, PX4 or Betaflight (docs/autopilots.md). With --firmware,
+    each is instead an emulation of a real drone's firmware on the network, for any program that can fly it.
 
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
@@ -162,7 +162,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
     """Return the options of the world that the drones share.
 
-    Raise ``UsageError`` if an option is invalid, or the drones can't share a world.
+    Raise ``UsageError`` if an option is invalid, or if the drones can't share a world.
     """
     from skyloop.vehicles.sim.options import options_of
 
@@ -198,7 +198,7 @@ def _serve_proxies(
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """Return the vehicles' address. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
+    """Return the address of the vehicles. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
@@ -228,7 +228,7 @@ MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """The addresses of the emulated drones, and the faults applied to their datagrams."""
+    """The addresses of the emulated drones, and the faults that are injected into their datagrams."""
 
     bind: str
     port_base: int | None  #: first port; None for the usual ones
@@ -238,10 +238,10 @@ class Serving:
 
 
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
-    """Run the drones until SIGINT or SIGTERM. Must run on the main thread.
+    """Run the drones until the process receives SIGINT or SIGTERM. Must run on the main thread.
 
-    Once all drones listen, print a line that begins with ``ready`` for each. Raise ``UsageError`` if an option is
-    invalid, or ``LinkError`` if a port is already in use.
+    Once all drones are listening, print one line for each that begins with ``ready``. Raise ``UsageError`` if an option
+    is invalid, and ``LinkError`` if a port is already in use.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
@@ -335,7 +335,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello. All use the same port, and each has the address after the previous one's.
+    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's.
 
     Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
     """
@@ -348,7 +348,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return an AR.Drone's ports, starting at ``base`` and 10 higher for each further drone; any free ones if it is 0.
+    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports.
 
     Raise ``UsageError`` if a port is out of range.
     """

@@ -1,4 +1,4 @@
-"""``skyloop teleop``: flies a drone with the terminal's keys."""
+"""``skyloop teleop``: flies a drone from the terminal's keyboard."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
 
 ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
-PERIOD_S: Final = 0.05  #: interval at which a moved stick is resent; each press is sent immediately
+PERIOD_S: Final = 0.05  #: interval at which the position of a moved stick is resent; each press is sent immediately
 REFRESH_HZ: Final = 8
 EVENTS_SHOWN: Final = 3
-GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the steps selected by + and -
+GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the gains selected by + and -
 
 
 def teleop(
@@ -41,7 +41,7 @@ def teleop(
     network: naming.NetworkOption = None,
     keys: naming.KeysOption = None,
 ) -> None:
-    """Fly with keys and watch the drone's state live. It hovers when no key is held, and lands at the end.
+    """Fly with the keyboard and watch the drone's state live. It hovers when no key is held, and lands at the end.
 
     The keys are the same as in the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q quit.
     """
@@ -57,14 +57,14 @@ def teleop(
         try:
             Teleop(flown, speed, turn, "" if page is None else page.address()).run(keyboard)
         except (KeyboardInterrupt, EOFError):
-            pass  # the same as Q: leaving the block lands the drone
+            pass  # same as pressing Q: leaving the block lands the drone
         finally:
             if page is not None:
                 page.close()
 
 
 class Teleop:
-    """One session of a pilot who flies with keys."""
+    """One session in which a pilot flies with the keyboard."""
 
     def __init__(self, drone: Drone, speed: float, turn: float, page: str = "") -> None:
         self._drone = drone
@@ -76,8 +76,8 @@ class Teleop:
         self._taking = threading.Thread()
 
     def run(self, keyboard: Keyboard) -> None:
-        """Fly until Q is pressed. Raise ``EOFError`` if the terminal is gone."""
-        # Draw on a separate thread: a stalled terminal must not delay keys.
+        """Fly until Q is pressed. Raise ``EOFError`` if the terminal has been closed."""
+        # Draw on a separate thread, because a stalled terminal must not delay keys.
         console = Console()
         with (
             keyboard,
@@ -95,7 +95,7 @@ class Teleop:
     def obey(self, order: Order | Deflection) -> None:
         """Carry out a command. If that is impossible, report it and change nothing.
 
-        Only taking control waits for an answer. It does so on a separate thread, so that an emergency stop still works.
+        Only taking control waits for a reply. It uses a separate thread, so that an emergency stop still works.
         """
         if order != "take":
             self._carry_out(order)
@@ -135,7 +135,7 @@ class Teleop:
         elif order == "land":
             drone.land(wait=False)
         elif order == "hover":
-            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # it may lag a take-off
+            if not (drone.feedback().state.airborne or commands(drone).wants_flight):  # the feedback may lag behind
                 return self._obey("grounded")
             drone.hover()
         elif order == "take":
@@ -156,7 +156,7 @@ class Teleop:
             self._message = f"the keys have no effect: {self._why_not()}"
 
     def _why_not(self) -> str:
-        """Return why the newest set-point has no effect."""
+        """Return the reason why the newest set-point has no effect."""
         link, told = self._drone.link, commands(self._drone).told
         if link.application not in (LinkState.UP, LinkState.DEGRADED):
             return f"the link is {link.application.value} ({link.reason})"
@@ -165,7 +165,7 @@ class Teleop:
         return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
-        """Return the whole display, most important first; the end is cut off if it does not fit."""
+        """Return the whole display, with the most important parts first; the end is cut off if it does not fit."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone

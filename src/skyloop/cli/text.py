@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 _PIPE_COLUMNS: Final = 10_000
 _PLAIN_ERRORS: Final = "skyloop.plain"
-#: Replacements for characters that a terminal's encoding lacks; others lose their accents or become "?".
+#: Replacements for characters missing from a terminal's encoding; other characters lose their accents or become "?".
 _PLAIN: Final = {
     **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
     **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
 }
 _RED: Final = 31
 _YELLOW: Final = 33
-#: Colours of lines, by the words that they begin with.
+#: Colours of output lines, by the words at their beginning.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 
@@ -63,7 +63,7 @@ def print_json(value: Any) -> None:
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON; a value without an equivalent in JSON, such as a path, becomes text."""
+    """Return a value as JSON; a value that JSON can't represent, such as a path, becomes text."""
     import msgspec
 
     return msgspec.json.encode(value, enc_hook=str).decode()
@@ -72,8 +72,8 @@ def json_text(value: Any) -> str:
 def coloured(line: str, stream: TextIO | None) -> str:
     """Return a line with its beginning coloured, if it has a known meaning and the stream shows colours.
 
-    A stream shows colours if it is a terminal, not a dumb one, and ``NO_COLOR`` is not set (https://no-color.org).
-    ``stream``: where the line is printed; None if that was closed before Python started.
+    A stream shows colours if it is a terminal that is not dumb and ``NO_COLOR`` is not set (https://no-color.org).
+    ``stream``: the stream that the line is printed to, or None if it was closed before Python started.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line
@@ -84,14 +84,14 @@ def coloured(line: str, stream: TextIO | None) -> str:
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Align rows that have equal numbers of cells, and return them as lines."""
+    """Align rows that have the same number of cells, and return them as lines."""
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
 
 
 def named(title: str) -> Column:
-    """Return a table column whose words are never cut; in a narrow terminal they wrap."""
+    """Return a table column whose words are never truncated; in a narrow terminal, they wrap."""
     from rich.table import Column
 
     return Column(title, overflow="fold")
@@ -100,8 +100,8 @@ def named(title: str) -> Column:
 def console() -> Console:
     """Return a console for tables on standard output.
 
-    It is as wide as the terminal or, in a pipe, as wide as the tables, so that nothing is cut. ``COLUMNS`` overrides
-    both.
+    It is as wide as the terminal or, in a pipe, as wide as the tables, so that nothing is truncated. ``COLUMNS``
+    overrides both.
     """
     from rich.console import Console
 
@@ -111,7 +111,7 @@ def console() -> Console:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on standard error, if that is a terminal, and remove it at the end.
+    """Show a progress bar on standard error if that is a terminal, and remove it at the end.
 
     Yield a function that updates the bar, given the fraction done (0 to 1) and optionally a new description.
     """

@@ -1,4 +1,4 @@
-"""``skyloop watch``: shows a drone's state, live in the terminal or line by line in a pipe."""
+"""``skyloop watch``: shows a drone's state, as a live display in a terminal or line by line in a pipe."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 REFRESH_HZ: Final = 8
-WIDE_COLUMNS: Final = 60  #: from this width on, two facts are shown side by side
-ROOMY_COLUMNS: Final = 90  #: from this width on, there is space between them
+WIDE_COLUMNS: Final = 60  #: at this width and above, two facts are shown side by side
+ROOMY_COLUMNS: Final = 90  #: at this width and above, there is space between them
 LINE_EVERY_S: Final = 1.0
 EVENTS_SHOWN: Final = 8
 COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
@@ -54,7 +54,7 @@ def watch(
     with connect(naming.one_drone(name, drone), access="observe", name="skyloop watch") as watched:
         duration_s = math.inf if seconds is None else seconds
         if video and watched.capabilities.cameras:
-            watched.frame()  # the first call subscribes
+            watched.frame()  # the first call subscribes to frames
         try:
             if json:
                 _lines(watched, duration_s, _state_json, _event_json)
@@ -63,16 +63,16 @@ def watch(
             else:
                 _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
-            pass  # the normal way to stop
+            pass  # this is the normal way to stop
 
 
 def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
-    """Print a line every second, with absolute deadlines; the first one immediately."""
+    """Print a line every second, with absolute deadlines; the first line is printed immediately."""
     due = time.monotonic()
     end = due + duration_s
 
     def show(one: Event) -> None:
-        with suppress(BrokenPipeError):  # the reader is gone; printing the next line will raise the same error
+        with suppress(BrokenPipeError):  # the reader has exited; printing the next line will raise the same error
             typer.echo(event(one))
 
     with drone.on_event(show):
@@ -128,7 +128,7 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """Return the whole display."""
+    """Return the complete display."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 
@@ -170,7 +170,7 @@ def _state(drone: Drone) -> Table:
 
 
 def channels(drone: Drone) -> Table:
-    """Return rates, delays and ages, one line per channel; in a narrow terminal, only the most important ones."""
+    """Return rates, delays and ages, one line per channel; a narrow terminal shows only the most important ones."""
     titles = ("rate", "delay median", "age", "p99", "lost", "dropped")
     table = Table(named("channel"), *((*titles[:1], "delay", "age") if _is_narrow() else titles), box=None)
     for name, channel in drone.stats.items():

@@ -1,7 +1,7 @@
 """The cockpit: a web page to watch, fly and understand every drone. Needs the extra ``cockpit``.
 
 The cockpit is an application like any other, in its own process: ``skyloop cockpit`` or ``python -m skyloop.cockpit``.
-It only observes. A page that takes control has its own pilot connection while it holds control.
+The recorder only observes. A page has its own pilot connection for as long as it holds control.
 
 - ``server`` runs the cockpit and ``listening`` accepts connections within limits; ``app`` and ``api`` hold the
   routes; ``security`` decides which requests are answered, ``access`` who sent them and what that person may do;

@@ -1,6 +1,6 @@
 """``python -m skyloop.cockpit [NAME …]``: the cockpit in its own process.
 
-The first line it prints is the page's address.
+The first line of output is the page's address.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from skyloop.network.config import choose
 def main(arguments: list[str] | None = None) -> int:
     """Run the cockpit.
 
-    ``arguments``: used in place of the command line's arguments. Return the exit code: 0, or 2 with a line of
-    explanation if it could not start.
+    ``arguments``: used instead of the command-line arguments. Return the exit code: 0, or 2 after printing an
+    explanation if the cockpit could not start.
     """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
     parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they appear)")

@@ -34,25 +34,25 @@ from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import decoded
 from skyloop.messages import Role
 
-SESSION_S: Final = 12 * 3600.0  #: lifetime of a session
-PAIRING_S: Final = 3600.0  #: lifetime of a pairing code
+SESSION_S: Final = 12 * 3600.0  #: period for which a session is valid
+PAIRING_S: Final = 3600.0  #: period for which a pairing code is valid
 MAX_SESSIONS: Final = 1000
 SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
 MAX_TOKEN: Final = 256
 CERTIFICATE: Final = "peer_certificate"  #: key under which a connection's state holds the client's certificate
 
-FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubles with each further one
-LONGEST_S: Final = 16.0  #: must be less than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
-FORGET_S: Final = 600.0  #: an address starts over if it sends no wrong token for this long
-MAX_ADDRESSES: Final = 1024  #: addresses remembered at once; the one that has been quiet for longest is forgotten first
-FREE_IN_ALL: Final = 20  #: wrong tokens per minute, from all addresses together, before the delay below is added
-EACH_IN_ALL_S: Final = 0.1  #: delay added by each wrong token beyond those, from any address
+FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubled by each further one
+LONGEST_S: Final = 16.0  #: must be less than :data:`skyloop.cockpit.listening.ANSWER_S`, or no response would arrive
+FORGET_S: Final = 600.0  #: an address starts over if it has sent no wrong token for this long
+MAX_ADDRESSES: Final = 1024  #: maximum number of addresses remembered; the quietest one is forgotten first
+FREE_IN_ALL: Final = 20  #: wrong tokens allowed per minute, over all addresses, before the delay below is added
+EACH_IN_ALL_S: Final = 0.1  #: additional delay for each wrong token beyond those, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _WORD: Final = "<I" if sys.byteorder == "little" else ">I"
-_LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of these tables
+_LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # column indexes in these tables
 
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
@@ -66,8 +66,8 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
 
     Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
     proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
-    state, …, user id and inode. A socket already closed by its program is listed with user 0 and inode 0, so an entry
-    without an inode does not reveal who opened it. Return the user id, or None if it is unknown.
+    state, …, user id and inode. A socket that its program has already closed is listed with user 0 and inode 0, so an
+    entry without an inode does not reveal who opened the socket. Return the user id, or None if it is unknown.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -78,7 +78,7 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
 
 
 def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
-    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is missing or unowned."""
+    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is missing or has none."""
     wanted = {(_table_entry(client, mapped), _table_entry(server, mapped)) for mapped in (False, True)}
     for line in table.splitlines()[1:]:
         cells = line.split()
@@ -88,7 +88,7 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 
 
 def _table_entry(end: Endpoint, mapped: bool) -> str:
-    """Format an address as in the table: 32-bit words in the host's byte order.
+    """Format an address as the table does: 32-bit words in the host's byte order.
 
     ``mapped``: whether to write an IPv4 address as an IPv4-mapped IPv6 address.
     """
@@ -102,7 +102,7 @@ def _table_entry(end: Endpoint, mapped: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """The sender of a request; ``name`` is empty if unknown."""
+    """The person who sent a request; ``name`` is empty if unknown."""
 
     role: Role
     name: str = ""
@@ -112,7 +112,7 @@ class Person:
         return self.role is Role.PILOT or role is Role.OBSERVER
 
     def display_name(self, requested: str) -> str:
-        """Return the name shown to others; ``requested`` is used only if the person's token or certificate has none."""
+        """Return the name shown to others; ``requested`` is used only if the token or certificate contains no name."""
         return self.name or " ".join("".join(filter(str.isprintable, requested)).split())[:MAX_NAME]
 
 
@@ -125,13 +125,13 @@ class Gate(Protocol):
     hint: str
 
     def person(self, scope: Scope) -> Person | None:
-        """Return who sent this request, or None if they are not admitted."""
+        """Return the person who sent this request, or None if that person is not admitted."""
 
 
 class OpenGate:
-    """Gives one role to every program of the same user on this machine.
+    """Gives the same role to every program of the same user on this machine.
 
-    ``uid_of``: returns the client's user id, given both ends' addresses.
+    ``uid_of``: returns the client's user id, given the addresses of both ends.
     """
 
     takes_tokens = False
@@ -158,7 +158,7 @@ class Token:
 
 
 class Pairing:
-    """Issues codes that admit one browser each, only once and within :data:`PAIRING_S`. Used on the event loop.
+    """Issues codes, each of which admits one browser, only once and within :data:`PAIRING_S`. Used on the event loop.
 
     ``role``: the role given to browsers that use a code.
     """
@@ -178,13 +178,13 @@ class Pairing:
         return self._code
 
     def expire(self) -> None:
-        """Drop the code if it has expired; to be called a few times a minute."""
+        """Drop the code if it has expired; this method must be called a few times a minute."""
         if self._code != "" and self._clock() >= self._until_ns:
             self._code = ""
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return the person who sent a code, and use the code up; None if it is not the current one."""
+        """Return the person whose code this is, and invalidate the code; None if it is not the current code."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
@@ -210,7 +210,7 @@ class TokenGate:
     ) -> None:
         """Restore the saved sessions whose token or pairing role is still valid.
 
-        ``pairing``: issues one-time codes, which can be used in place of a token. ``kept``: where sessions are stored
+        ``pairing``: issues one-time codes that can be used instead of a token. ``kept``: where sessions are stored
         between runs of the cockpit.
         """
         self.cookie = cookie
@@ -220,7 +220,7 @@ class TokenGate:
         self._clock = clock
         self._kept = kept
         saved = [] if kept is None else kept.load()
-        self._sessions = {one.cookie: one for one in saved if self._still_lets_in(one)}  # by hash of the cookie
+        self._sessions = {one.cookie: one for one in saved if self._still_lets_in(one)}  # keyed by cookie hash
 
     def person(self, scope: Scope) -> Person | None:
         header = _header(scope, b"authorization")
@@ -234,7 +234,7 @@ class TokenGate:
         return Person(session.role, session.name) if session is not None and self._clock() < session.until_ns else None
 
     def wrong_token_s(self, scope: Scope) -> float:
-        """Count a wrong token; return how long to delay the answer [s]."""
+        """Count a wrong token; return how long to delay the response [s]."""
         return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
@@ -247,7 +247,7 @@ class TokenGate:
         return found
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
-        """Return the person who has this token or pairing code, and use a code up; None if it is neither."""
+        """Return the person who has this token or pairing code, and invalidate a code; None if it is neither."""
         found = self.known(token)
         if found is None and self.pairing is not None:
             found = self.pairing.person(token, _address(scope))
@@ -256,7 +256,7 @@ class TokenGate:
     def begin(self, person: Person, token: str = "") -> str:
         """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
 
-        ``token``: the token that the session was given for.
+        ``token``: the token for which the session was created.
         """
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
@@ -317,7 +317,7 @@ def read_tokens(path: Path) -> list[Token]:
     """Read the token file.
 
     Each line has the form ``ROLE TOKEN [NAME]``; empty lines and lines starting with # are skipped. Raise
-    ``UsageError`` if the file can't be read, or is readable by others, or ``FileFormatError`` if a line is invalid, or
+    ``UsageError`` if the file can't be read or others can read it, and ``FileFormatError`` if a line is invalid or
     there is no token.
     """
     try:
@@ -352,7 +352,7 @@ def _token(line: str, where: str) -> Token:
 
 
 def _hash(value: str) -> bytes:
-    """Hash a cookie, so that the time taken to look it up reveals nothing about it."""
+    """Hash a cookie, so that the time needed to look it up reveals nothing about it."""
     return hashlib.sha256(value.encode()).digest()
 
 
@@ -378,23 +378,23 @@ def _cookies(scope: Scope) -> dict[str, str]:
 
 
 class WrongTokens:
-    """Determines how long to delay the answer to a wrong token. Used on the event loop.
+    """Determines how long to delay the response to a wrong token. Used on the event loop.
 
-    The delay grows with the number of wrong tokens, both from the same address and overall. A correct token is never
-    delayed, so an attacker can't lock out its owner, not even from the same address. Only rejections get slower: a
-    guesser who waits for the answers gets few of them. A guesser who takes silence for a rejection is limited only by
-    the rate of connections; the length of the tokens protects against that.
+    The delay grows with the number of wrong tokens, both from the same address and in total. A correct token is never
+    delayed, so an attacker can't lock out the token's owner, not even from the same address. Only rejections are
+    delayed: an attacker who waits for the responses can make only a few guesses. An attacker who takes silence for a
+    rejection is limited only by the rate of connections; the length of the tokens protects against such attacks.
     """
 
     def __init__(self, clock: Clock = monotonic_ns) -> None:
-        self.count = 0  #: number of wrong tokens since the start
+        self.count = 0  #: number of wrong tokens since startup
         self._clock = clock
-        self._of_address: dict[str, tuple[int, int]] = {}  # wrong tokens and time of the last; quietest first
+        self._of_address: dict[str, tuple[int, int]] = {}  # number of wrong tokens, time of the last; quietest first
         self._minute_ns = clock()
         self._in_minute = 0
 
     def another(self, address: str) -> float:
-        """Count a wrong token from an address; return how long to delay the answer [s]."""
+        """Count a wrong token from an address; return how long to delay the response [s]."""
         now_ns = self._clock()
         before, last_ns = self._of_address.pop(address, (0, now_ns))
         many = 1 if seconds(now_ns - last_ns) >= FORGET_S else before + 1
@@ -405,7 +405,7 @@ class WrongTokens:
             self._minute_ns, self._in_minute = now_ns, 0
         self._in_minute += 1
         self.count += 1
-        if many.bit_count() == 1:  # 1, 2, 4, 8, …: a guesser must not fill the log
+        if many.bit_count() == 1:  # log 1, 2, 4, 8, … wrong tokens, so that an attacker can't fill the log
             _log.warning("%d wrong tokens from %s", many, address)
         of_address_s = min(LONGEST_S, FIRST_S * 2.0 ** min(many - 1, 16))
         in_all_s = min(MOST_IN_ALL_S, EACH_IN_ALL_S * max(0, self._in_minute - FREE_IN_ALL))
@@ -422,7 +422,7 @@ class Session(msgspec.Struct, frozen=True):
     """One log-in."""
 
     cookie: bytes  #: the cookie's hash
-    origin: bytes  #: hash of the token it was given for; empty if it was given for a pairing code
+    origin: bytes  #: hash of the token for which the session was created; empty if it was created for a pairing code
     role: Role
     name: str
     until_ns: int  #: expiry on the monotonic clock
@@ -436,8 +436,8 @@ class _Content(msgspec.Struct):
 class SessionFile:
     """Stores the sessions of one cockpit, so that after a restart a page reconnects without logging in again.
 
-    Only this user may read the file, next to the proxies' sockets. It contains hashes of cookies and tokens, which
-    can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
+    Only this user may read the file, which is next to the proxies' sockets. It contains hashes of cookies and tokens,
+    which can't be used to log in. Its times are on the monotonic clock, so a reboot invalidates them.
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:
@@ -445,7 +445,7 @@ class SessionFile:
         self._boot = boot_id() if boot is None else boot
 
     def load(self) -> list[Session]:
-        """Return the sessions; none if the file is missing, damaged, another user's or from before a reboot."""
+        """Return the sessions; none if the file is missing, damaged, owned by others or from before a reboot."""
         try:
             descriptor = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             with os.fdopen(descriptor, "rb") as file:
@@ -457,7 +457,7 @@ class SessionFile:
         return content.sessions if content is not None and self._boot and content.boot == self._boot else []
 
     def save(self, sessions: Iterable[Session]) -> None:
-        """Replace the file. If that fails, people only have to log in again after a restart."""
+        """Replace the file. If this fails, the only consequence is that people have to log in again after a restart."""
         new = self._path.with_name(f"{self._path.name}.new")
         try:
             with suppress(FileNotFoundError):

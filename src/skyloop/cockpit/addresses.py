@@ -1,4 +1,4 @@
-"""Determine where the page is served: its sockets, its addresses, and the lines printed in the terminal."""
+"""Determine where the page is served: its sockets, its addresses, and the lines printed on the terminal."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.errors import UsageError
 
 DEFAULT_PORT: Final = 8420
-NEXT_PORTS: Final = 9  #: number of further ports to try if the default is taken
+NEXT_PORTS: Final = 9  #: number of further ports to try if the default port is in use
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _LISTENS: Final = "0A"  # state of a listening socket in the kernel's socket tables
-_LOCAL, _STATE, _INODE = 1, 3, 9  # columns of these tables
+_LOCAL, _STATE, _INODE = 1, 3, 9  # column indexes in these tables
 _SIOCGIFADDR: Final = 0x8915  # Linux ioctl that returns an interface's IPv4 address
 _MDNS: Final = Path("/run/avahi-daemon/socket")
 _MAX_COMMAND: Final = 60
@@ -34,7 +34,7 @@ def bind(address: str, port: int | None) -> socket.socket:
             one, and name the program that uses the default on standard error.
 
     Raises:
-        UsageError: The port is taken or unusable.
+        UsageError: The port is in use or unusable.
     """
     if port is not None:
         return _bind(address, port)
@@ -53,7 +53,7 @@ def _bind(address: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((address, port))
-        listening.listen(0)  # listen at once: two programs may bind the same port until one of them listens
+        listening.listen(0)  # listen immediately, because two programs may bind the same port until one of them listens
     except (OSError, OverflowError) as error:
         listening.close()
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
@@ -80,7 +80,7 @@ def listener_of(port: int) -> str:
         return ""
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
-            with suppress(OSError):  # another user's process, or it has ended
+            with suppress(OSError):  # the process belongs to another user, or it has ended
                 if any(str(entry.readlink()) in inodes for entry in (process / "fd").iterdir()):
                     command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
                     return f"process {process.name} ({command[:_MAX_COMMAND]})"
@@ -88,10 +88,10 @@ def listener_of(port: int) -> str:
 
 
 def reachable(address: str) -> list[str]:
-    """Return the addresses at which others can reach a service bound to ``address``, best first.
+    """Return the addresses at which other machines can reach a service bound to ``address``, best first.
 
-    If the machine has no network, return its loopback address. ``address`` is one of this machine's, ``0.0.0.0`` or
-    ``::``.
+    If the machine is on no network, return its loopback address. ``address`` is an address of this machine, ``0.0.0.0``
+    or ``::``.
     """
     known = ipaddress.ip_address(address)
     if not known.is_unspecified:
@@ -110,7 +110,7 @@ def reachable(address: str) -> list[str]:
 def own_addresses() -> list[str]:
     """Return the IPv4 addresses of this machine on its networks, ordered by interface; empty except on Linux.
 
-    Needed on networks that have no default route, such as a drone's own Wi-Fi or a lab without internet access.
+    Used on networks that have no default route, such as a drone's own Wi-Fi or a lab without internet access.
     """
     if sys.platform != "linux":
         return []
@@ -126,7 +126,7 @@ def own_addresses() -> list[str]:
 
 
 def host_names() -> tuple[str, ...]:
-    """Return this machine's host name, and its multicast DNS name if a program answers for that."""
+    """Return this machine's host name, and its multicast DNS name if a program answers for that name."""
     name = socket.gethostname()
     return (name, f"{name.partition('.')[0]}.local") if _MDNS.exists() else (name,)
 
@@ -145,10 +145,10 @@ def qr_code(text: str) -> str:
 
 
 class Announcer:
-    """Prints the page's address, with a QR code for phones if others can reach the page and the terminal can show one.
+    """Prints the page's address, with a QR code if other machines can reach the page and the terminal can show one.
 
-    With pairing, the address in the QR code contains the pairing code after the ``#``, in the part that browsers never
-    send. The next code is printed as soon as the last one has been used or has expired. ``pairing``: issues the codes;
+    With pairing, the address in the QR code contains the code after the ``#``, in the part that browsers never send.
+    The next code is printed as soon as the last one has been used or has expired. ``pairing``: issues the codes, or
     None if everyone is admitted or people have tokens. ``loopback``: whether only this machine can reach the page.
     """
 

@@ -1,4 +1,4 @@
-"""Determine a drone's alarms from its links, feedback and ages, without side effects.
+"""Determine a drone's alarms from its links, feedback and the age of its data, without side effects.
 
 The thresholds are parameters of the drone's proxy, so they are the same on every page.
 """
@@ -36,8 +36,8 @@ class Alarm(msgspec.Struct, frozen=True):
     """A problem that currently exists.
 
     Args:
-        id: The alarm's subject. It stays the same while the alarm lasts, so a page can remember acknowledgements.
-        severity: May rise while the alarm lasts, for example when a degraded link is lost.
+        id: The subject of the alarm. It is constant while the alarm lasts, so a page can remember the acknowledgement.
+        severity: Its level may rise while the alarm lasts, for example when a degraded link is lost.
         text: A description that includes the current value.
     """
 
@@ -82,13 +82,13 @@ def alarms(
 ) -> list[Alarm]:
     """Return the current alarms, the most severe first.
 
-    ``video_age_s``: age of the frame shown [s], for each camera that is watched. ``degraded_s``: how long each degraded
-    hop has been degraded [s], from :class:`DegradedTimes`.
+    ``video_age_s``: age of the frame shown [s], for each camera that someone is watching. ``degraded_s``: how long each
+    degraded hop has been degraded [s], from :class:`DegradedTimes`.
     """
     # On the ground there is time: an alarm is urgent only if the vehicle is, or was last reported, in the air.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
     if link.application in _BROKEN:
-        # All other information is out of date.
+        # All other information is outdated.
         return [urgent("application_link", _because("link to the proxy lost", link.reason))]
     if link.vehicle is LinkState.CLOSED:
         return []  # nothing is wrong: a replay has reached its end
@@ -175,13 +175,13 @@ class ThresholdReader:
         self._listener = drone.on_event(lambda event: call_soon(loop, self.on_event, event))
 
     def on_event(self, event: Event) -> None:
-        """Note that the thresholds may have changed."""
+        """Record that the thresholds may have changed."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._is_stale, self._tried_ns = True, None
 
     def newest(self) -> Thresholds:
-        """Return the thresholds last read; start reading them again if they may have changed. Does not block."""
+        """Return the thresholds read last; start reading them again if they may have changed. Does not block."""
         now_ns = self._clock()
         rested = self._tried_ns is None or now_ns - self._tried_ns >= nanoseconds(RETRY_S)
         if self._is_stale and rested and self._task is None:
@@ -197,13 +197,13 @@ class ThresholdReader:
         try:
             self._values = await asyncio.to_thread(thresholds_of, self._drone.config)
         except SkyloopError:
-            self._is_stale = True  # no answer: try again after RETRY_S
+            self._is_stale = True  # there was no answer: try again after RETRY_S
         finally:
             self._task = None
 
 
 def thresholds_of(config: Config | Mapping[str, Value]) -> Thresholds:
-    """Read the thresholds; use the default for any that the proxy lacks or that is not finite."""
+    """Read the thresholds; use the default for each threshold that the proxy lacks or that is not finite."""
     return msgspec.structs.replace(USUAL, **{field: _number(config, name, field) for field, name in PARAMETERS.items()})
 
 
@@ -214,4 +214,4 @@ def _number(config: Config | Mapping[str, Value], name: str, field: str) -> floa
     except UnknownNameError:
         return usual
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if is_number else usual  # type: ignore[arg-type]  # a number, as just checked
+    return float(value) if is_number else usual  # type: ignore[arg-type] # a number, as was just checked

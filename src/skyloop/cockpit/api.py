@@ -40,7 +40,7 @@ _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
-    (ClosedError, 404),  # a replay that has just ended
+    (ClosedError, 404),  # the replay has just ended
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),
@@ -49,12 +49,12 @@ _STATUS: Final = (
 
 T = TypeVar("T")
 Handler = Callable[[Any, Request], Awaitable[Response]]
-MAX_ASKING: Final = 4  #: simultaneous parameter requests to proxies; each may block its thread for seconds
-MOST_CHECKS: Final = 4  #: simultaneous route checks; each queries a proxy and may block its thread for seconds
+MAX_ASKING: Final = 4  #: maximum number of parallel requests for parameters; each may block its thread for seconds
+MOST_CHECKS: Final = 4  #: maximum number of parallel route checks; each may block its thread for seconds
 
 
 class BadRequest(Exception):  # noqa: N818  (HTTP's name for it)
-    """An invalid request; ``status`` is the HTTP status of the answer."""
+    """An invalid request; ``status`` is the HTTP status of the response."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -62,7 +62,7 @@ class BadRequest(Exception):  # noqa: N818  (HTTP's name for it)
 
 
 def answered(handler: Handler) -> Handler:
-    """Convert a handler's exceptions into an answer with a status and ``{"error": why}``."""
+    """Convert a handler's exceptions into a response with a status and ``{"error": why}``."""
 
     @wraps(handler)
     async def answer(self: Any, request: Request) -> Response:
@@ -80,7 +80,7 @@ def answered(handler: Handler) -> Handler:
 
 
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Do work for a request, but cancel it if the client disconnects."""
+    """Do work for a request, but cancel the work if the client disconnects."""
     task, gone = asyncio.create_task(work), asyncio.create_task(_gone(request))
     try:
         await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -103,7 +103,7 @@ def answer_json(values: Any, status: int = 200) -> Response:
 
 
 def check_json(request: Request) -> None:
-    """Check the content type; browsers let pages of other sites send this one only with the server's permission."""
+    """Check the content type; browsers let other sites send this type only with the server's permission."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
         raise BadRequest(415, f"the content type must be {_JSON}")
 
@@ -170,7 +170,7 @@ class Api:
     # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
-        """Answer with the client's role, or with null for strangers, and a hint on how to log in."""
+        """Respond with the client's role, or with null for strangers, and a hint on how to log in."""
         person = person_of(request.scope)
         return answer_json(
             {
@@ -183,7 +183,7 @@ class Api:
 
     @answered
     async def login(self, request: Request) -> Response:
-        """Exchange a token for a session cookie; delay the answer to a wrong token."""
+        """Exchange a token for a session cookie; delay the response if the token is wrong."""
         gate = self._gate
         if not isinstance(gate, TokenGate):
             raise BadRequest(404, "this cockpit uses no tokens")
@@ -219,7 +219,7 @@ class Api:
 
     @answered
     async def authority(self, _: Request) -> Response:
-        """Answer with the certificate for browsers to trust, as a file."""
+        """Respond with the certificate that browsers should trust, as a file."""
         if self._authority is None:
             raise BadRequest(404, "this cockpit made no certificate: start it with --https")
         answer = Response(self._authority, media_type="application/x-x509-ca-cert")
@@ -229,7 +229,7 @@ class Api:
     # Drones ----------------------------------------------------------------------------------------------------
 
     async def drones(self, _: Request) -> Response:
-        """Answer with the connected drones."""
+        """Respond with the connected drones."""
         return answer_json(
             [
                 {"name": name, "uri": one.drone.uri, "cameras": [c.name for c in one.drone.capabilities.cameras]}
@@ -239,16 +239,16 @@ class Api:
 
     @answered
     async def parameters(self, request: Request) -> Response:
-        """Answer with a drone's parameters."""
+        """Respond with a drone's parameters."""
         station = self._fleet.station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
         return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
-        """Answer with counts of the messages sent to pages.
+        """Respond with counts of the messages sent to pages.
 
-        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts only the current cameras.
+        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` covers only the current cameras.
         """
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return answer_json(
@@ -271,7 +271,7 @@ class Api:
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter as JSON values, including everything needed to edit it."""
+    """Return a parameter as JSON values, including all information needed to edit it."""
     return {
         "name": parameter.name,
         "type": str(parameter.type),
@@ -288,12 +288,12 @@ def parameter_values(parameter: Parameter) -> dict[str, Any]:
 
 
 def _value(value: Value) -> Any:
-    """Return a value for JSON; the encoder converts numbers that are not finite to null."""
+    """Return a value as JSON; the encoder converts numbers that are not finite to null."""
     return list(value) if isinstance(value, tuple) else value
 
 
 class RoutesApi:
-    """The routes below ``/api/routes``, and the check of a route for one drone."""
+    """The routes below ``/api/routes``, including the check of a flight route for one drone."""
 
     def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
         self._fleet = fleet
@@ -311,7 +311,7 @@ class RoutesApi:
 
     @answered
     async def check(self, request: Request) -> Response:
-        """Answer with a route's problems for a drone, and the ``id`` by which to fly it."""
+        """Respond with the problems of a route for a drone, and the ``id`` used to fly that route."""
         station = self._fleet.station(request.path_params["name"])
         route = parse_route(bytes(await body_of(request, msgspec.Raw)))
         async with self._checking:
@@ -320,12 +320,12 @@ class RoutesApi:
 
     @answered
     async def listing(self, _: Request) -> Response:
-        """Answer with the stored routes."""
+        """Respond with the stored routes."""
         return answer_json(await asyncio.to_thread(self._files.listing))
 
     @answered
     async def load(self, request: Request) -> Response:
-        """Answer with a route's file."""
+        """Respond with a route's file."""
         route = await asyncio.to_thread(self._files.load, request.path_params["name"])
         return Response(route.to_json(), media_type="application/json")
 

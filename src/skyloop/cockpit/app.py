@@ -1,4 +1,4 @@
-"""The cockpit's routes: one page, JSON requests, WebSockets for live data. ``docs/cockpit.md`` describes them all.
+"""The cockpit's routes: one page, JSON requests, and WebSockets for live data. ``docs/cockpit.md`` describes them.
 
 ======================================  ==================================================================
 ``/``, ``/static/…``                    the page
@@ -56,7 +56,7 @@ from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
-SMALLEST_PACKED: Final = 1000  #: minimum size of an answer worth compressing [bytes]
+SMALLEST_PACKED: Final = 1000  #: minimum size of a response worth compressing [bytes]
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
@@ -65,17 +65,17 @@ _FOR_GOOD: Final = "private, max-age=31536000, immutable"
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A file's content; ``stamp`` shows whether the file has changed since it was read."""
+    """A file's content; ``stamp`` is used to detect whether the file has changed since it was read."""
 
     stamp: tuple[int, int]
     kind: str
     hash: str
     plain: bytes
-    packed: bytes | None  #: None if it is sent uncompressed
+    packed: bytes | None  #: None if the file is sent uncompressed
 
 
 class PageFiles(StaticFiles):
-    """Serves the folder that contains the page. ``folder``: the folder; it need not exist."""
+    """Serves the folder that contains the page. ``folder``: the folder, which need not exist."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder, check_dir=False)
@@ -83,7 +83,7 @@ class PageFiles(StaticFiles):
         self._files: dict[str, _File] = {}
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """Return a file, compressed if the browser accepts that."""
+        """Return a file, compressed if the browser accepts compression."""
         try:
             full, found = self.lookup_path(path)
         except (OSError, ValueError):
@@ -127,7 +127,7 @@ class PageFiles(StaticFiles):
         stamp = (found.st_mtime_ns, found.st_size)
         file = self._files.get(full)
         if file is None or file.stamp != stamp:
-            # Use a thread: compressing the 3-D view takes some 30 ms, and pilots' commands must not wait for it.
+            # Use a thread: compressing the 3-D view takes about 30 ms, and pilots' commands must not wait for it.
             file = self._files[full] = await asyncio.to_thread(_read, full, stamp)
         return file
 
@@ -168,7 +168,7 @@ class Cockpit:
             await self._fleet.close()
 
     async def page(self, _: Request) -> Response:
-        """Answer with the page."""
+        """Respond with the page."""
         return await self.files.page()
 
     async def overview(self, socket: WebSocket) -> None:
@@ -251,11 +251,11 @@ def create_app(
     Args:
         fleet: The drones.
         recordings: The recordings of the same drones.
-        names: The only host names that are answered.
+        names: The only host names that the server answers to.
         gate: Decides who is admitted.
         static: The page's folder.
         admission: Counts the connections.
-        world: The surroundings to show for drones that don't report any.
+        world: The surroundings to show for drones that report none.
         follower: Creates a follower for each target marked on a page.
         page_authority: PEM certificate of the authority that signed the server's certificate, for browsers to trust.
     """

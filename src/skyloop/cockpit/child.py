@@ -1,4 +1,4 @@
-"""Run the cockpit as a child process, for programs that show a page while doing their own work."""
+"""Run the cockpit as a child process, for programs that show a page while they do their own work."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class CockpitProcess:
     def __init__(self, name: str | None = None, port: int | None = 0, recordings: Path | None = None) -> None:
         """Start the child without waiting for the page; see :meth:`address`.
 
-        ``name``: the proxy to show; all by default. ``port``: the loopback port; 0 selects a free one, None the default
-        or the next free one.
+        ``name``: the proxy to show; by default, all proxies are shown. ``port``: the loopback port; 0 selects a free
+        port, and None the default port or the next free one.
         """
         names = [] if name is None else [name]
         options = [] if recordings is None else ["--recordings", str(recordings)]
@@ -40,8 +40,8 @@ class CockpitProcess:
     def address(self, timeout_s: float = 15.0) -> str:
         """Wait until the page is served.
 
-        Raise ``LinkError`` if the page was not served in time, or the child ended, with its last line of standard
-        error.
+        Raise ``LinkError`` if the page was not served in time or the child ended; the error contains its last line of
+        standard error.
         """
         deadline = time.monotonic() + timeout_s
         line = b""
@@ -56,7 +56,7 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """Return the counts of messages sent to its pages, as in ``/api/statistics``."""
+        """Return the counts of messages sent to the cockpit's pages, as in ``/api/statistics``."""
         try:
             with urllib.request.urlopen(f"{self.address()}api/statistics", timeout=_ASK_S) as answer:
                 values: dict[str, Any] = json.load(answer)

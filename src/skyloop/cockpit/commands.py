@@ -1,4 +1,4 @@
-"""Decode a page's commands, one JSON object per message with its kind in ``do``, and check that they are recent."""
+"""Decode a page's commands (one JSON object per message, with its kind in ``do``) and check that they are recent."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ CameraName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
-LATE_S: Final = 0.5  #: a command that may be older is refused, because its sender no longer expects it to be obeyed
+LATE_S: Final = 0.5  #: a command that may be older is refused; its sender no longer expects it to be obeyed
 #: Maximum age of an emergency stop; the page shows the stop as pending for this long.
 STOP_LATE_S: Final = 2.0
-#: If pushed sticks have not moved for this long, nobody is assumed to hold them. Bluetooth can take up to 20 s to
-#: report a lost gamepad.
+#: If deflected sticks have not moved for this long, the page assumes that nobody is holding them. Bluetooth can take up
+#: to 20 s to report a lost gamepad.
 UNTOUCHED_S: Final = 10.0
-AHEAD_S: Final = 0.05  #: clock difference tolerated beyond the page's own bound, the same as for programs' commands
-SETTLED_NS: Final = 50_000_000  #: feedback captured within this time after a command may predate it [ns]
+AHEAD_S: Final = 0.05  #: clock difference tolerated beyond the page's own bound; the same as for commands from programs
+SETTLED_NS: Final = 50_000_000  #: feedback captured this soon after a command may predate the command [ns]
 
 
 class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):
     """The base of all commands from a page."""
 
-    #: When the person requested it, on the cockpit's clock as the page estimates it from pongs [s].
+    #: Time at which the person requested it, on the cockpit's clock as the page estimates it from pongs [s].
     at_s: float | None = None
     unsure_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  #: uncertainty of ``at_s`` [s]
-    n: int = 0  #: number chosen by the page and repeated in the answers
+    n: int = 0  #: number chosen by the page and repeated in the responses
 
     @property
     def do(self) -> str:
@@ -40,29 +40,29 @@ class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields
 
 
 class Take(Command, frozen=True, tag="take"):
-    """Request control authority with a priority from 0, the highest, to 31."""
+    """Request control authority with a priority from 0 (highest) to 31."""
 
     priority: Priority
-    ask: bool = False  #: ask the holder first, and wait in the queue
+    ask: bool = False  #: whether to ask the holder first and wait in the queue
 
 
 class Release(Command, frozen=True, tag="release"):
-    """Give up the authority, or leave the queue."""
+    """Release authority, or leave the queue."""
 
 
 class Answer(Command, frozen=True, tag="answer"):
-    """The holder's answer to a request for its authority."""
+    """The holder's response to a request for its authority."""
 
     id: int  #: id of the question
     grant: bool
-    reason: Reason = ""  #: reason for a refusal, shown to the person who asked
+    reason: Reason = ""  #: reason for a refusal, shown to the person who made the request
 
 
 class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover at a person's request or, if ``automatic``, because no input is held; the latter never takes control."""
+    """Hover because a person requested it or, if ``automatic``, because no input is held, without taking control."""
 
     automatic: bool = False
 
@@ -71,7 +71,7 @@ class LandHere(Command, frozen=True, tag="land"): ...
 
 
 class Stop(Command, frozen=True, tag="stop"):
-    """Cut the motors. This needs no authority."""
+    """Cut the motors. This command needs no authority."""
 
 
 class Reset(Command, frozen=True, tag="reset"):
@@ -85,7 +85,7 @@ class Fly(Command, frozen=True, tag="fly"):
     left: float = 0.0
     up: float = 0.0
     yaw_rate: float = 0.0
-    #: Counter of signs of a hand: moving fingers, repeating keys, raw axes. None if the page does not report it.
+    #: Counter of signs of a hand: moving fingers, repeating keys, raw axis values. None if the page does not report it.
     touches: int | None = None
 
 
@@ -99,11 +99,11 @@ class GoTo(Command, frozen=True, tag="goto"):
 
 
 class FlyBack(Command, frozen=True, tag="return"):
-    """Fly back to the take-off position and land or hover there, depending on the drone's parameters."""
+    """Fly back to the take-off position and then land or hover there, depending on the drone's parameters."""
 
 
 class FlyRoute(Command, frozen=True, tag="route"):
-    """Fly a checked route; ``id`` comes from the answer to the check."""
+    """Fly a checked route; ``id`` comes from the response to the check."""
 
     id: Annotated[str, msgspec.Meta(max_length=64)]
 
@@ -125,28 +125,28 @@ class StopRoute(Command, frozen=True, tag="route_stop"):
 
 
 class SelectTarget(Command, frozen=True, tag="follow_select"):
-    """Keep a camera's frames while a person draws a box on one of them; if None, stop."""
+    """Keep a camera's frames while a person draws a box on one of them; if the camera is None, stop keeping them."""
 
     camera: CameraName | None
 
 
 class FollowTarget(Command, frozen=True, tag="follow"):
-    """Track the content of a box and, if a mode is given, follow it."""
+    """Track the object inside a box and, if a mode is given, follow it."""
 
     camera: CameraName
     captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: capture time of the frame under the box [ns]
     box: tuple[float, float, float, float]  #: x and y of its upper left corner, width and height [pixels]
-    mode: Word | None = None  #: if None, only track until a mode is set
+    mode: Word | None = None  #: if None, only track the target until a mode is set
     class_name: Word | None = None  #: class of a selected detection
     distance_m: float | None = None  #: distance to keep; None for the follower's default
     size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None for the frame's size
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
-    """Follow the tracked target, or change the following mode."""
+    """Follow the tracked target, or change the mode of following."""
 
     mode: Word
-    distance_m: float | None = None  #: distance to keep; None for no change
+    distance_m: float | None = None  #: distance to keep from the target; None to leave it unchanged
 
 
 class StopFollowing(Command, frozen=True, tag="follow_stop"):
@@ -161,7 +161,7 @@ class Write(Command, frozen=True, tag="set"):
 
 
 class Alive(Command, frozen=True, tag="ping"):
-    """Report that the page is present and receives data: ``seen_s`` is the ``now_s`` in its newest pong."""
+    """Report that the page is present and receives data: ``seen_s`` is the ``now_s`` of its newest pong."""
 
     seen_s: float | None = None
 
@@ -223,32 +223,32 @@ def late_s(command: Command) -> float:
 
 
 class HandWatch:
-    """Determines whether a hand is holding the pushed sticks. Pure.
+    """Determines whether a person's hand is holding the deflected sticks. Pure.
 
-    Hands are never still: a finger moves by pixels, a held key repeats, an axis at its limit jitters. The values from a
-    gamepad that has lost its radio link stay constant, as do those of a page that has lost track of held keys.
+    Hands are never still: fingers move by pixels, held keys repeat, and axes at their limits jitter. The values from a
+    gamepad that has lost its radio link stay constant; so do those from a page that has lost track of held keys.
     """
 
     def __init__(self) -> None:
-        """Start with untouched sticks."""
+        """Initialise with untouched sticks."""
         self._last: Fly | None = None
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Handle a stick command; return whether there has been a sign of a hand within :data:`UNTOUCHED_S`."""
+        """Handle a stick command; return whether there was a sign of a hand within :data:`UNTOUCHED_S`."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
         )
-        if not same or sticks.touches is None:  # a pause is not a sign of a hand: networks cause pauses, too
+        if not same or sticks.touches is None:  # a pause is no sign of a hand; networks cause pauses, too
             self._moved_s = now_s
         return now_s - self._moved_s <= UNTOUCHED_S
 
 
 def untimely(command: Command, now_s: float) -> str:
-    """Return why a command is refused because of its age; empty if it is recent enough.
+    """Return the reason for refusing a command because of its age; empty if the command is recent enough.
 
-    A command whose age is unknown is refused, and one that might be too old is treated as too old.
+    A command whose age is unknown is refused, and a command that might be too old is treated as too old.
     """
     if command.at_s is None:
         return "it has no time (at_s): send a ping first, its pong has the cockpit's clock"

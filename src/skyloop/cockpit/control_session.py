@@ -1,12 +1,12 @@
-"""One page's control of one drone: convert the page's messages to commands for the vehicle, and answer them.
+"""One page's control of one drone: convert the page's messages to commands for the vehicle, and respond to them.
 
 A command that arrives in time (:func:`skyloop.cockpit.commands.untimely`) is carried out; any other is refused and
-never carried out later. The only exception is the hover sent for released sticks, which may be of any age.
+never carried out later. The only exception is the hover sent when sticks are released, which may be of any age.
 
-The page has a dead-man switch: if it flies with sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
-vehicle hovers. A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated as a
-silent pilot: the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts, as it
-would for any program. When the page's connection ends, the vehicle hovers at once and the authority is released.
+The page has a dead-man switch: if the page flies with sticks or to a waypoint and sends nothing for :data:`SILENT_S`,
+the vehicle hovers. A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated
+as a silent pilot: the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts as
+it would for any program. When the page's connection ends, the vehicle hovers immediately and authority is released.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 
-SILENT_S: Final = 0.5  #: a page that flies but sends nothing for this long is considered dead
-#: A page that receives nothing from the cockpit for this long can't fly, and its control expires.
+SILENT_S: Final = 0.5  #: a page that is flying but sends nothing for this long is considered dead
+#: If a page receives nothing from the cockpit for this long, it can't fly, and its control expires.
 GONE_S: Final = 2.0
-_REFUSE_AGAIN_S: Final = 1.0  # interval between equal refusals of stick commands, which arrive 20 times a second
+_REFUSE_AGAIN_S: Final = 1.0  # interval between identical refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-# Time limits for repeating a take-off: without and with an acknowledgement by the proxy.
+# Time limits for repeating a take-off: without and with the proxy's acknowledgement.
 _TAKEOFF_NS: Final = 1_000_000_000
 _BEGUN_NS: Final = 6_000_000_000
 _numbers = itertools.count(1)
@@ -74,7 +74,7 @@ class ControlSession:
         self._send = self._page.send
         self._station = station
         self._clock = clock
-        #: The name shown to other applications.
+        #: The application name that other applications see.
         self.app = f"{person} (cockpit {next(_numbers)})" if person else f"cockpit {next(_numbers)}"
         self._pilot: PilotConnection | None = None
         self._jobs: set[asyncio.Task[None]] = set()
@@ -83,15 +83,15 @@ class ControlSession:
         self._follow = FollowSession(station.drone, self._send, self._end_flight, follower, clock)
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
-        self._steering = False  # whether the newest set-point is a velocity from this page's sticks
-        self._stood_down = False  # whether it stopped commanding the vehicle in mid-flight, and has not resumed since
+        self._steering = False  # whether the newest set-point is a velocity commanded by this page's sticks
+        self._stood_down = False  # whether it stopped commanding the vehicle in mid-flight without resuming since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
         self._decided = ("", 0)  # ``do`` and ``n`` of the page's last decision, even if it was refused or is waiting
-        # The last command that ended an earlier one, and the number of its first intent.
+        # The last command that ended an earlier command, and the number of the first intent of that last command.
         self._last_command, self._first = ("", 0), 0
-        self._decisions = 0  # counts commands that fly or end a flight; compared by jobs that have waited
+        self._decisions = 0  # number of commands so far that fly or end a flight; compared by jobs that have waited
         self._hands = commands.HandWatch()
         self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
             None  # ``do``, ``n``, the states that complete it, and the start time
@@ -128,7 +128,7 @@ class ControlSession:
 
     @property
     def waits(self) -> bool:
-        """Whether the page waits for the authority, either in the queue or to get it back."""
+        """Whether the page is waiting for authority, either in the queue or to regain it."""
         return self._pilot is not None and self._pilot.authority.state in ("queued", "preempted")
 
     async def run(self) -> None:
@@ -150,7 +150,7 @@ class ControlSession:
     # Messages from the page ------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
-        """Carry out the page's commands. Of the stick commands that have queued up, use only the newest."""
+        """Carry out the page's commands. If several stick commands have queued up, use only the newest."""
         decoded: list[AnyCommand] = []
         for text in texts:
             try:
@@ -165,27 +165,27 @@ class ControlSession:
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
         if not problem and not _is_deaf(command, now_ns):
-            self._restart_silence_timer()  # an old message is not a sign of life
+            self._restart_silence_timer()  # an old message is no sign of life
         if isinstance(command, Alive):
             self._on_ping(command, now_ns)
             return
         try:
             if problem and not (
                 isinstance(command, commands.HoverHere) and command.automatic
-            ):  # the page sends this only once
+            ):  # the page sends this command only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
-                # A stop has its own connection, so refusals seen here never belong to it.
+                # A stop has its own connection, so refusals seen here never concern a stop.
                 self._decided = self._decided if isinstance(command, commands.Stop) else (command.do, command.n)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
 
     def _on_ping(self, ping: Alive, now_ns: int) -> None:
-        """Answer, and treat the page as present until :data:`GONE_S` after it last received data from the cockpit."""
+        """Respond, and treat the page as present until :data:`GONE_S` after it last received data from the cockpit."""
         if ping.seen_s is not None and self._pilot is not None:
-            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # in case the page claims a time in the future
+            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # in case the page sends a time in the future
             self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
         self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
 
@@ -194,7 +194,7 @@ class ControlSession:
     ) -> None:
         """Send one command, ending the page's previous flight.
 
-        The command is complete once it is sent or, if ``until`` names states, once the vehicle is in one of them.
+        The command is complete once it is sent or, if ``until`` contains states, once the vehicle is in one of them.
         ``act``: sends the command; returns whether it was sent. ``until``: the states that complete the command.
         """
         pilot = self._held()
@@ -206,23 +206,23 @@ class ControlSession:
             self._done(command.do, command.n)
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
-        """End the page's previous flight and send a command; raise :class:`LinkError` if it was not sent."""
+        """End the page's previous flight and send a command; raise :class:`LinkError` if the command was not sent."""
         with self._in_place_of(pilot, f"{command.do} was commanded"):
             sent = act(pilot)
         if not sent:
             with suppress(SkyloopError):
-                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
+                pilot.idle()  # otherwise it would still be executed if the link were restored soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
 
     @contextmanager
     def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
-        """End the page's previous flight; hover if what replaces it is refused."""
+        """End the page's previous flight; hover if the command that replaces it is refused."""
         self._end_flight(why)
         with _else_hovering(pilot, "its replacement was refused"):
             yield
 
     def _hover_here(self, command: commands.HoverHere) -> None:
-        """Hover because a person asked for it, or because the page reports that no key or stick is held."""
+        """Hover because a person requested it, or because the page reports that no key or stick is held."""
         if command.automatic:
             self._held()
             self.let_go("nothing is held on the page")
@@ -243,7 +243,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     def _set_out(self, command: AnyCommand, plan: Callable[[PilotConnection], Leg]) -> None:
-        """Command a flight to a place and monitor it until it is over."""
+        """Command a flight to a place and monitor the flight until it ends."""
         pilot = self._held()
         leg = plan(pilot)
         self._send_now(pilot, lambda pilot: pilot.command(leg.action), command)
@@ -252,7 +252,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     async def _fly_route(self, command: commands.FlyRoute, held: Callable[[], PilotConnection]) -> None:
-        """Check a route again, because much may have changed, and fly it."""
+        """Check a route again, because the situation may have changed, and fly it."""
         route = self._station.routes.get(command.id)
         held()
         check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
@@ -283,7 +283,7 @@ class ControlSession:
         self._acknowledge(command)
 
     async def _follow_target(self, command: commands.FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track the content of a box. The authority is needed only if a mode is given."""
+        """Track the object inside a box. Authority is needed only if a mode is given."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
@@ -305,13 +305,13 @@ class ControlSession:
             self._station.goals[self.app] = goal
 
     def _end_route(self) -> None:
-        """End the route permanently: its connection ends, or another route or flight replaces it."""
+        """End the route permanently: its connection ended, or another route or flight replaces it."""
         if self._route is not None:
             self._route.end(hover=False)
             self._route = None
 
     async def _stop_motors(self, command: commands.Stop) -> None:
-        """Stop the motors, retrying as long as the page shows the command as pending."""
+        """Stop the motors; keep trying for as long as the page shows the command as pending."""
         assert command.at_s is not None  # a command without a time has already been refused
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
         try:
@@ -333,7 +333,7 @@ class ControlSession:
             raise LinkError("the link to the proxy is lost: take control when it is back")
         pilot.present_until(monotonic_ns() + nanoseconds(GONE_S))
         if self.waits and not command.ask and not self._authority.outranks(command.priority):
-            # Asking the proxy again would give up the place in the queue.
+            # Another request to the proxy would give up the place in the queue.
             raise AuthorityError(f"{self._authority.busy(command.priority)}; you stay in the queue", code="busy")
         self._takeover.request(ask=command.ask)
         self._acknowledge(command)
@@ -352,7 +352,7 @@ class ControlSession:
         pilot = self._held()
         self._acknowledge(command)
         if command.grant:
-            self._authority.handed_over()  # observers may see this before the proxy has confirmed the answer
+            self._authority.handed_over()  # observers may notice this before the proxy has confirmed the answer
         try:
             await self._takeover.answer(command, pilot)
         except RefusedError:
@@ -369,7 +369,7 @@ class ControlSession:
         self._update()
 
     async def _close_pilot(self) -> None:
-        """Close the page's own connection, which is not needed without the authority."""
+        """Close the page's own connection, which is not needed without authority."""
         self._end_route()
         pilot, self._pilot = self._pilot, None
         if pilot is not None:
@@ -388,9 +388,9 @@ class ControlSession:
         self._send({"type": "done", "do": command.do, "name": command.name, "value": value})
 
     def _held(self) -> PilotConnection:
-        """Return the connection that holds the authority.
+        """Return the connection that holds authority.
 
-        Raise ``AuthorityError`` if the page does not hold the authority.
+        Raise ``AuthorityError`` if the page does not hold authority.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
@@ -401,10 +401,10 @@ class ControlSession:
         return pilot
 
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
-        """Return a check to use in place of :meth:`_held` in a job that waits for answers.
+        """Return a check that replaces :meth:`_held` in a job that waits for responses.
 
-        The check raises :class:`RefusedError` if another command has flown or ended a flight since then (the
-        newest decision wins), or if the command has become too old.
+        The check raises :class:`RefusedError` if another command has flown or ended a flight since then (the newest
+        decision wins), or if the command is now too old.
         """
         number = self._decisions
 
@@ -441,9 +441,9 @@ class ControlSession:
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
     def _end_flight(self, why: str = "another command was given, or the page was silent") -> None:
-        """End the page's previous flight. A route is only paused and can be resumed."""
+        """End the page's previous flight. A route, by contrast, is only paused and can be resumed."""
         self._decisions += 1
-        if self._decided != self._last_command:  # earlier intents and their refusals belong to the previous command
+        if self._decided != self._last_command:  # earlier intents, and refusals of them, belong to the previous command
             self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
         self._steering = self._stood_down = False
         self._follow.interrupt(why)
@@ -461,7 +461,7 @@ class ControlSession:
             pilot.let_go(why)
 
     def stand_down(self, why: str) -> None:
-        """Send no more commands, because the motors are being stopped. The authority is kept."""
+        """Send no more commands, because the motors are being stopped. Authority is kept."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         self._stood_down = flies
@@ -472,24 +472,24 @@ class ControlSession:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _on_page_gone(self) -> None:
-        """Hover at once, because the page has disconnected."""
+        """Hover immediately, because the page has disconnected."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
         self.let_go("the page is gone")
 
     async def _close(self) -> None:
-        """Wait for running jobs and release the authority."""
+        """Wait for running jobs and release authority."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         await self._follow.close()
-        self.let_go("the page is gone")  # a job may only now have taken control or begun a flight
+        self.let_go("the page is gone")  # a job may have taken control or started a flight just now
         await self._close_pilot()
         await self._station.pilot_went()
 
     # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Send changes in the authority and in open questions to the page, and report completed commands."""
+        """Send changes of authority and of open questions to the page, and report completed commands."""
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
@@ -504,7 +504,7 @@ class ControlSession:
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
                     with suppress(SkyloopError):
-                        pilot.idle()  # one under way continues, but none may begin when a slow link recovers
+                        pilot.idle()  # a landing in progress continues, but none may begin when a slow link recovers
             with suppress(LinkError):
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
@@ -512,7 +512,7 @@ class ControlSession:
                     self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
-        """Handle requests to take over."""
+        """Handle requests to take over control."""
         if self._pilot is not None:
             self._takeover.on_event(event, self._pilot)
 
@@ -525,12 +525,12 @@ class ControlSession:
         watched = self._follow.is_under_way or (self._route is not None and self._route.is_under_way)
         refused = outcome.fate in (Fate.UNDER_WAY, Fate.REFUSED, Fate.OTHERS)
         if not watched and (refused or self._awaited or self._is_under_way):
-            self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows its own name
+            self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows its pilot
         if watched or self._place.is_under_way:
-            self.let_go(outcome.text)  # this feedback also shows whether others have taken control
+            self.let_go(outcome.text)  # this feedback also reveals whether others have taken control
         elif self._last_command[0] == commands.TakeOff().do:
             with suppress(SkyloopError):
-                pilot.idle()  # otherwise it would take off unexpectedly as soon as it could
+                pilot.idle()  # otherwise the drone would take off unexpectedly as soon as it could
         self._awaited = None
 
     def _refuse(self, do: str, n: int, why: str) -> None:
@@ -540,7 +540,7 @@ class ControlSession:
         self._send({"type": "done", "do": do} | ({"n": n} if n else {}))
 
     def _refuse_command(self, command: AnyCommand, why: str) -> None:
-        if isinstance(command, Fly):  # these arrive 20 times a second
+        if isinstance(command, Fly):  # stick commands arrive 20 times a second
             now_s = seconds(self._clock())
             before, at_s = self._last_refusal
             if why == before and now_s - at_s <= _REFUSE_AGAIN_S:
@@ -552,7 +552,7 @@ class ControlSession:
         self._send({"type": "sent", "do": command.do, "n": command.n})
 
     def _run_in_turn(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
-        """Start a job that may block, after the jobs started earlier have ended."""
+        """Start a job that may block, once the jobs started earlier have ended."""
         self._start_job(self._run(command, work))
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
@@ -562,7 +562,7 @@ class ControlSession:
         try:
             async with self._turn:
                 problem = untimely(command, seconds(self._clock()))
-                if problem:  # earlier jobs took too long
+                if problem:  # the earlier jobs took too long
                     raise RefusedError(problem)
                 await work(command)
         except SkyloopError as error:
@@ -571,7 +571,7 @@ class ControlSession:
 
 @contextmanager
 def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
-    """Hover if the command in this block is refused, because the previous flight is no longer monitored."""
+    """Hover if the command in this block is refused, because by then the previous flight is no longer monitored."""
     try:
         yield
     except SkyloopError:
@@ -580,14 +580,14 @@ def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
 
 
 def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
-    """Return whether a ping shows that its page receives nothing; such a page hovers before it counts as gone."""
+    """Return whether a ping indicates that its page receives no data; such a page hovers before it counts as gone."""
     if not isinstance(command, Alive) or command.seen_s is None:
         return False
     return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S
 
 
 def _decides(command: AnyCommand) -> bool:
-    """Return whether a command flies or ends a flight."""
+    """Return whether a command starts, controls or ends a flight."""
     if isinstance(command, commands.FollowTarget):
         return command.mode is not None
     return not isinstance(command, commands.Take | commands.Answer | commands.Write | commands.SelectTarget | Alive)

@@ -1,4 +1,4 @@
-"""Find the proxies on this host and on the network without the proxies noticing."""
+"""Find the proxies on this host and on the network, without being noticed by them."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Found(NamedTuple):
 
 
 class Finder(Protocol):
-    """Searches for proxies repeatedly, on threads other than the event loop's."""
+    """Searches for proxies repeatedly, on threads other than that of the event loop."""
 
     def __call__(self) -> list[Found]:
         """Return the proxies that can be connected to now."""
 
     def add_name(self, name: str) -> None:
-        """Also find this proxy, if the search is limited to certain names."""
+        """Also find this proxy if the search is limited to certain names."""
 
     def close(self) -> None:
         """Release the resources of the search. Idempotent."""
@@ -41,7 +41,7 @@ class LocalFinder:
     """Finds the proxies on this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
-        """Prepare the search. ``names``: the names to search for; if empty, all."""
+        """Prepare the search. ``names``: the names to search for; if empty, search for all names."""
         self._names = frozenset(names)
         self._also: set[str] = set()
         self._known: dict[tuple[str, Path], Found] = {}
@@ -53,7 +53,7 @@ class LocalFinder:
         """Do nothing, because nothing was opened."""
 
     def __call__(self) -> list[Found]:
-        if sys.platform != "linux":  # proxies run only on Linux
+        if sys.platform != "linux":  # proxies run on Linux only
             return []
         from skyloop.transport.base import NAME
         from skyloop.transport.local import dial
@@ -78,19 +78,19 @@ class LocalFinder:
 class NetworkFinder:
     """Finds the proxies on this host, and those on the network that have other names. Any thread.
 
-    The first search opens a session and keeps it, so that later searches are cheap.
+    The first search opens a session and keeps it open, so later searches are cheap.
     """
 
     def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
         """Prepare the search.
 
         ``local``: finds the proxies of this host. ``settings``: how to join the network. ``wanted``: the names to
-        search for; if empty, all.
+        search for; if empty, search for all names.
         """
         self._local = local
         self._settings = settings
         self._wanted = wanted
-        self._lock = threading.Lock()  # guards the following fields: several threads may search
+        self._lock = threading.Lock()  # guards the following fields, because several threads may search
         self._session: Session | None = None
         self._known: dict[str, Found] = {}
 
@@ -123,7 +123,7 @@ class NetworkFinder:
         with self._lock:
             current = self._settings.current()
             if self._session is not None and current is not self._settings:
-                release(self._session)  # the roster has changed, and revoked members must no longer be found
+                release(self._session)  # the roster has changed, and revoked members must not be discovered anymore
                 self._session = None
             self._settings = current
             if self._session is None:

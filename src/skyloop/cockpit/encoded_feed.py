@@ -1,7 +1,7 @@
-"""One camera's frames for all pages that show them: encoded to JPEG once for all pages; H.264 is relayed unchanged.
+"""One camera's frames for all pages that show them: JPEGs are encoded once for all pages; H.264 is relayed unchanged.
 
-The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. H.264 pictures depend on the
-previous ones, so a page receives all of them in order or resumes at a key frame. Nothing is encoded to H.264 here.
+The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. H.264 pictures depend on earlier
+ones, so a page receives all of them in order or resumes at a key frame. This module encodes nothing to H.264.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ NICENESS: Final = 10  #: niceness of the encoding thread
 
 
 def _give_way() -> None:
-    if sys.platform == "linux":  # elsewhere, only whole processes have a priority
+    if sys.platform == "linux":  # on other systems, only whole processes have a priority
         os.nice(NICENESS)
 
 
-#: One thread for all cameras, because encoding for many pages must not take cores from flying. The event loop keeps its
-#: original priority: a person's sticks and stop pass through it, and a browser must not starve it.
+#: One thread for all cameras, because encoding for many pages must not take CPU cores away from flying. The event loop
+#: keeps its original priority: stick and stop commands pass through it, and a browser must not starve it.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
-KEPT: Final = 16  #: pictures kept per stream; a page further behind resumes at a key frame
-SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: few scales, so that similar panes share a stream
-RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: few rates [kbit/s]
+KEPT: Final = 16  #: number of pictures kept per stream; a page further behind resumes at a key frame
+SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: only a few scales, so that similar panes share a stream
+RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: only a few rates [kbit/s]
 BITS: Final = 0.12  #: bits per pixel of a video stream
 _FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
@@ -56,9 +56,9 @@ P = TypeVar("P")
 
 @dataclass(frozen=True, slots=True)
 class Numbered(Generic[P]):
-    """A picture for pages, with a number that is unique in this process, even if the proxy restarts.
+    """A picture for pages, with a number that stays unique in this process even if the proxy restarts.
 
-    For H.264, the number increases by exactly one only if the picture continues the previous one.
+    For H.264, the number increases by exactly one only if the picture continues the previous picture.
     """
 
     serial: int
@@ -66,7 +66,7 @@ class Numbered(Generic[P]):
 
 
 class CameraFeed:
-    """The newest frame of one camera, encoded at most once for all pages, and only while a page shows it."""
+    """The newest frame of one camera; it is encoded at most once for all pages, and only while a page shows it."""
 
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
@@ -74,7 +74,7 @@ class CameraFeed:
         self.encoded = 0  #: number of frames encoded to JPEG
         self._drone = drone
         self._clock = clock
-        self._since_ns = 0  # when the first page subscribed
+        self._since_ns = 0  # time at which the first page subscribed
         self._listener: Listener[Any] | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
@@ -86,7 +86,7 @@ class CameraFeed:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame. The first subscriber subscribes to the camera."""
+        """Call ``wake`` on the loop for each newer frame. The first subscriber opens the camera's subscription."""
         self._wakes.add(wake)
         if self._listener is None:
             loop = asyncio.get_running_loop()
@@ -96,7 +96,7 @@ class CameraFeed:
             wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``. The last subscriber unsubscribes from the camera."""
+        """Stop calling ``wake``. When the last subscriber leaves, unsubscribe from the camera."""
         self._wakes.discard(wake)
         if not self._wakes and self._listener is not None:
             self._listener.cancel()
@@ -104,16 +104,16 @@ class CameraFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or the time spent waiting for one.
+        """Age of the newest frame [s], or the time spent waiting for the first frame.
 
-        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
+        None while no page shows the camera, and before the first frame, which a vehicle may take seconds to send.
         """
         if self._listener is None or not self._serial:
             return None
         return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.picture.age_s
 
     async def jpeg(self, picture: Numbered[Frame]) -> bytes:
-        """Return the picture as a JPEG file, encoded on a thread, once for all pages."""
+        """Return the picture as a JPEG file, which is encoded on a thread, once for all pages."""
         if self._jpeg is None or self._jpeg[0] != picture.serial:
             loop = asyncio.get_running_loop()
             self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.picture)
@@ -127,7 +127,7 @@ class CameraFeed:
             self._listener = None
 
     def _put(self, frame: Frame) -> None:
-        if self._listener is None:  # cancelled before this call arrived
+        if self._listener is None:  # the subscription was cancelled before this call arrived
             return
         self._serial += 1
         self.newest = Numbered(self._serial, frame)
@@ -155,7 +155,7 @@ def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
 
 
 FPS: Final = 12.0  #: maximum frame rate of each camera
-WIDTHS: Final = (160, 240, 320, 480)  #: widths of frames [pixels]; a page's request is rounded up to one of them
+WIDTHS: Final = (160, 240, 320, 480)  #: frame widths [pixels]; the width a page requests is rounded up to one of them
 QUALITY: Final = 70  #: quality of the JPEG files
 
 
@@ -172,9 +172,9 @@ class SmallFrame:
 
 
 class SmallFeed:
-    """One camera's newest frame in one size, as a JPEG file, while a page shows it. Used on the event loop.
+    """A camera's newest frame in one size, encoded as a JPEG file while a page shows it. Used on the event loop.
 
-    ``width``: the width to scale down to [pixels]; smaller frames are left unchanged.
+    ``width``: the width to which frames are scaled down [pixels]; smaller frames are left unchanged.
     """
 
     def __init__(self, drone: Drone, camera: CameraInfo, width: int, clock: Clock = monotonic_ns) -> None:
@@ -197,7 +197,7 @@ class SmallFeed:
     def age_s(self) -> float | None:
         """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
+        None while no page shows the camera, and before the first frame, which a vehicle may take seconds to send.
         """
         if not self.wanted or not self.encoded:
             return None
@@ -209,18 +209,18 @@ class SmallFeed:
     def subscribe(self) -> None:
         """Add a page that shows the camera; the first one subscribes to the camera.
 
-        Raise ``SkyloopError`` if the drone was closed, or no longer has this camera.
+        Raise ``SkyloopError`` if the drone was closed or no longer has this camera.
         """
         if self._listener is None:
             self._since_ns = self._clock()
-            # Inline, because the callback does very little and a thread per camera would be woken for each frame.
+            # Inline, because the callback does very little, whereas a thread per camera would be woken for each frame.
             self._listener = self._drone.on_frame(
                 self._put, camera=self.camera, inline=True, encoding="jpeg", max_fps=FPS, scale=self._scale
             )
         self._pages += 1
 
     def unsubscribe(self) -> None:
-        """Remove a page that no longer shows the camera; without pages, unsubscribe from the camera."""
+        """Remove a page that no longer shows the camera; when no pages are left, unsubscribe from the camera."""
         self._pages -= 1
         if self._pages == 0:
             self.close()
@@ -232,7 +232,7 @@ class SmallFeed:
             self._listener = self.newest = None
 
     def _put(self, frame: Frame) -> None:
-        """Encode a frame and keep it. Runs on the drone's receiving thread."""
+        """Encode a frame and store the result. Runs on the drone's receiving thread."""
         jpeg = to_jpeg(frame, QUALITY)
         self.encoded += 1
         height, width = frame.shape[:2]
@@ -240,16 +240,16 @@ class SmallFeed:
 
 
 def rounded_width(wish: int) -> int:
-    """Round a width [pixels] up to one of :data:`WIDTHS`, or down to the largest."""
+    """Round a width [pixels] up to one of :data:`WIDTHS`, or down to the largest width."""
     return next((width for width in WIDTHS if width >= wish), WIDTHS[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """The encoding of a camera's stream: by default, the vehicle's own.
+    """The encoding of a camera's stream; by default, the encoding chosen by the vehicle.
 
-    ``kbit_s``: the bit rate of a stream shared by all subscribers with the same values. ``subscriber``: the name of the
-    only subscriber, for which rate and size are adapted to its path.
+    ``kbit_s``: the bit rate of a stream that all subscribers with the same values share. ``subscriber``: the name of
+    the only subscriber, whose path determines the rate and size.
     """
 
     kbit_s: int | None = None
@@ -266,10 +266,10 @@ class Form:
 
 
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
-    """Return the encoding shared by all panes of about the same size.
+    """Return the encoding that all panes of about the same size share.
 
-    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum number of pictures per second,
-    None for no limit.
+    ``width``: width of the pane [device pixels], or 0 for full size. ``max_fps``: maximum number of pictures per
+    second, None for no limit.
     """
     scale = 1.0
     if 0 < width < camera.width:
@@ -293,7 +293,7 @@ class EncodedFeed:
         self._counter = ChannelCounter()
         self._drone = drone
         self._clock = clock
-        self._came_ns = 0  # when the newest picture arrived
+        self._came_ns = 0  # time at which the newest picture arrived
         self._channel: StreamChannel | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serial = 0
@@ -310,7 +310,7 @@ class EncodedFeed:
     def age_s(self) -> float | None:
         """Age of the newest picture [s].
 
-        None while no page shows the camera, before the first picture, and for a stream to a single page, whose age
+        None while no page shows the camera, before the first picture, and for a single page's stream, because its age
         depends on that page's path rather than on the camera.
         """
         with self._lock:
@@ -321,7 +321,7 @@ class EncodedFeed:
 
     @property
     def silent_s(self) -> float:
-        """Time without a picture [s]; 0 if the stream's only page may simply not be accepting any."""
+        """Time without a picture [s]; 0 if the only page of the stream may simply not be accepting any."""
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
@@ -333,8 +333,8 @@ class EncodedFeed:
     def subscribe(self, page: object, wake: Wake | None) -> None:
         """Add a page that shows the pictures; the first one subscribes to the stream, which starts with a key frame.
 
-        ``wake``: called on the event loop for each picture; None if the page polls. Raise ``SkyloopError`` if the drone
-        was closed, or no longer has this camera.
+        ``wake``: called on the event loop for each picture, or None if the page polls. Raise ``SkyloopError`` if the
+        drone was closed or no longer has this camera.
         """
         if self._channel is None:
             form = self.form
@@ -354,7 +354,7 @@ class EncodedFeed:
             self._wakes[page] = wake
 
     def unsubscribe(self, page: object) -> None:
-        """Remove a page that no longer shows the pictures; without pages, unsubscribe from the stream."""
+        """Remove a page that no longer shows the pictures; when no pages are left, unsubscribe from the stream."""
         with self._lock:
             self._wakes.pop(page, None)
         if not self.wanted:
@@ -371,13 +371,13 @@ class EncodedFeed:
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
         """Return the next pictures for a page, in order, and the number of pictures skipped before them.
 
-        ``serial``: number of the last picture sent to the page, or 0. ``follows``: whether the page can decode
+        ``serial``: number of the last picture sent to the page, or 0 if none. ``follows``: whether the page can decode
         the next picture; if not, it resumes at a key frame.
         """
         with self._lock:
             newer = [one for one in self._pictures if one.serial > serial]
         for first in range(len(newer) - 1, 0, -1):
-            if newer[first].picture.key:  # no earlier picture is needed
+            if newer[first].picture.key:  # this one depends on no earlier picture
                 break
         else:
             first = 0
@@ -390,17 +390,17 @@ class EncodedFeed:
         return chosen, chosen[0].serial - serial - 1 if serial else 0
 
     def ask_for_key(self) -> None:
-        """Request a key frame from the proxy, but only a few times a second."""
+        """Request a key frame from the proxy, but at most a few times a second."""
         if self._channel is not None:
             self._channel.report(0, wants_key=True)
 
     def acknowledge(self, seq: int) -> None:
-        """Report to the proxy which pictures the page has, if the rate depends on that."""
+        """Report to the proxy which pictures the page has received, if the rate depends on that."""
         if self._channel is not None and self.form.subscriber:
             self._channel.report(seq)
 
     def _put(self, picture: EncodedFrame) -> None:
-        """Keep a picture. Runs on the drone's receiving thread."""
+        """Store a picture. Runs on the drone's receiving thread."""
         with self._lock:
             last = self._pictures[-1].picture.seq if self._pictures else 0
             self._serial += 1 if picture.seq == last + 1 else 2

@@ -1,6 +1,6 @@
 """Pass data other than frames from the client's threads to the event loop, and to pages at a steady rate.
 
-This includes the newest drawing from each source, the latest events, applications' logs, and the commands applied.
+This data includes the newest drawing from each source, the latest events, applications' logs, and the applied commands.
 Everything runs on the event loop, except for the callbacks registered with the drone.
 """
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
 KEPT_EVENTS = 256
-KEPT_S = 10.0  #: older drawings and logs are no longer shown
+KEPT_S = 10.0  #: older drawings and logs are removed from the display
 MAX_SERIES = 256  #: maximum number of logged series shown per drone
-MAX_SOURCES = 64  #: maximum number of sources of drawings shown per drone, over all its cameras
+MAX_SOURCES = 64  #: maximum number of sources of drawings shown per drone, across all of its cameras
 MAX_WAYPOINTS = 256  #: maximum number of waypoints shown per path
 WAYPOINTS = "waypoints"  #: name under which a controller logs its goals
-MOCAP_S = 0.5  #: older motion capture poses are not shown
+MOCAP_S = 0.5  #: older poses from motion capture are not shown
 
 _KEPT_NS = round(KEPT_S * 1e9)
 
@@ -58,7 +58,7 @@ class PeriodicBroadcast:
     """Creates a message at a steady rate, once for all subscribers, while there are any. Used on the event loop."""
 
     def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
-        """Initialise without starting; the first subscriber starts it.
+        """Initialise the broadcast without starting it; the first subscriber starts it.
 
         ``on_change``: called with True before the first subscriber is added, and with False after the last has left.
         """
@@ -76,7 +76,7 @@ class PeriodicBroadcast:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and immediately for a fresh one, unless the broadcast is closed."""
+        """Call ``wake`` for each new message, and at once if one is already fresh, unless the broadcast is closed."""
         if self.closed:
             wake()
             return
@@ -88,7 +88,7 @@ class PeriodicBroadcast:
         wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``; do nothing if it is not subscribed."""
+        """Stop calling ``wake``; if it is not subscribed, do nothing."""
         if wake in self._wakes:
             self._wakes.discard(wake)
             if not self._wakes:
@@ -119,20 +119,20 @@ class PeriodicBroadcast:
 
 
 class Newest(Generic[K, V]):
-    """The newest value for each of at most ``most`` keys, forgotten after :data:`KEPT_S`.
+    """The newest value for each of up to ``most`` keys; values are forgotten after :data:`KEPT_S`.
 
-    A key keeps its place as long as its value is updated, however many others compete for one. One thread calls
-    :meth:`put`, others read.
+    A key keeps its place as long as its value is updated, however many other keys compete for a place. One thread calls
+    :meth:`put`; other threads read.
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: number of values refused for lack of room
+        self.refused = 0  #: number of values refused because there was no room
         self._most = most
         self._clock = clock
-        self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the most recently updated comes last
+        self._values: dict[K, tuple[int, V]] = {}  # each with its arrival time; the most recently updated comes last
 
     def put(self, key: K, value: V) -> None:
-        """Set a key's value. If there is no room for a new key, refuse it and count the refusal."""
+        """Set a key's value. If there is no room for a new key, refuse the key and count the refusal."""
         now_ns = self._clock()
         if self._values.pop(key, None) is None and len(self._values) >= self._most:
             oldest = next(iter(self._values))
@@ -169,7 +169,7 @@ def drawing_values(annotation: Annotation) -> dict[str, Any]:
     return {
         "type": "drawing",
         "source": annotation.source,
-        "captured_ns": str(annotation.captured_ns),  # too large for numbers in JavaScript
+        "captured_ns": str(annotation.captured_ns),  # too large for a JavaScript number
         "width": annotation.width,
         "height": annotation.height,
         "shapes": [_shape(shape) for shape in annotation.shapes],
@@ -185,25 +185,25 @@ def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
 
 
 class EventFeed:
-    """The drone's annotations and events.
+    """The annotations and events of the drone.
 
     Events are numbered here, because events created by the client have no number.
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
-        self.drawings: Newest[tuple[str, str], Drawing] = Newest(MAX_SOURCES, clock)  #: by camera and source
+        self.drawings: Newest[tuple[str, str], Drawing] = Newest(MAX_SOURCES, clock)  #: keyed by camera and source
         self.events: deque[tuple[int, Event]] = deque(enumerate(drone.recent_events(), 1), maxlen=KEPT_EVENTS)
         self._next = len(self.events) + 1
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
-        self._waking = False  # a wake-up of the pages has been scheduled
+        self._waking = False  # whether a wake-up of the pages has been scheduled
         self._listeners: list[Listener[Any]] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop when a newer drawing exists."""
+        """Call ``wake`` on the loop when there is a newer drawing."""
         self._wakes.add(wake)
 
     def unsubscribe(self, wake: Wake) -> None:
@@ -211,7 +211,7 @@ class EventFeed:
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return the events numbered above ``number``, with their numbers, oldest first."""
+        """Return the events with numbers above ``number``, together with their numbers, oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class EventFeed:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        """Keep a drawing. Runs on the client's thread, and schedules only one call on the loop for several drawings."""
+        """Store a drawing. Runs on the client's thread; several drawings schedule only one call on the loop."""
         self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
         if not self._waking:
             self._waking = True
@@ -237,9 +237,9 @@ class EventFeed:
 
 
 class LogFeed:
-    """The logs of applications, and the command last applied.
+    """The logs of applications, and the last command applied.
 
-    Subscribed to only on demand, to save the proxy work. The client's receiving thread replaces the values as a whole.
+    Subscribed to only on demand, to spare the proxy work. The client's receiving thread replaces the values as a whole.
     """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
@@ -252,7 +252,7 @@ class LogFeed:
         self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe if the values are wanted; otherwise unsubscribe and forget them."""
+        """Subscribe if the values are wanted; otherwise, unsubscribe and forget the values."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -271,13 +271,13 @@ class LogFeed:
 
     @property
     def refused(self) -> int:
-        """Number of logged values refused for lack of room."""
+        """Number of logged values refused because there was no room."""
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the array ``waypoints`` that was logged last, if within :data:`KEPT_S`.
+        """Return the most recently logged array ``waypoints``, if it was logged within :data:`KEPT_S`.
 
-        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
+        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are no waypoints.
         """
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
@@ -285,7 +285,7 @@ class LogFeed:
     def mocap(self) -> tuple[float, ...] | None:
         """Return the newest pose from motion capture.
 
-        Return x, y, z [m] and quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
+        Return x, y, z [m] and the quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
         """
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None

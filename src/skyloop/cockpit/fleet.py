@@ -1,9 +1,9 @@
-"""All drones known to the cockpit: finding, observing and forgetting them, showing lost ones; commands to all of them.
+"""All drones known to the cockpit: finding, observing and forgetting them, showing lost ones, and commanding them all.
 
-All pages share one connection to each drone. If a drone disappears, its connection searches for it and restores it; the
-drone is removed only after a long absence and if no page shows it. All of this runs on the event loop, except for
-connecting and closing, which may block and therefore run on threads. A page's commands to all drones, land all and stop
-all, work without any drone being open or selected.
+All pages share one connection to each drone. If a drone disappears, its connection searches for it and restores it. The
+drone is removed only after a long absence, and only if no page shows it. Everything here runs on the event loop, except
+for connecting and closing, which may block and therefore run on threads. A page's commands to all drones (land all,
+stop all) work even if no drone is open or selected.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
 
 LOOK_S: Final = 0.5
-FORGET_S: Final = 60.0  #: a drone lost for longer than this is no longer shown
+FORGET_S: Final = 60.0  #: a drone lost for longer than this is removed from the page
 CONNECT_S: Final = 3.0
 OVERVIEW_S: Final = 0.5  #: interval between overviews sent to pages
-FIRST_SEARCH_S: Final = 2.0  #: maximum time for which the first pages wait for slow drones
+FIRST_SEARCH_S: Final = 2.0  #: maximum time that the first pages wait for slow drones
 
 Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
-LANDING_S: Final = 60.0  #: time for which a landing is repeated
-BEGIN_S: Final = 2.0  #: time limit for the connection that is needed to begin a landing
+LANDING_S: Final = 60.0  #: time for which the landing command is repeated
+BEGIN_S: Final = 2.0  #: time limit for opening the connection needed to begin a landing
 _POLL_S: Final = 0.05
 
 Json = dict[str, Any]
@@ -59,7 +59,7 @@ def observe(found: Found) -> Drone:
 class Fleet:
     """The stations, by drone name.
 
-    ``connect``: connects to a proxy; called on threads. ``kept``: names that stay listed once found.
+    ``connect``: connects to a proxy; called on worker threads. ``kept``: names that stay listed once found.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Fleet:
         self._begun: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
-        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies found, then keep searching."""
+        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies that were found, then keep searching."""
         await self.search()
         if self._connecting:
             await asyncio.wait(list(self._connecting.values()), timeout=FIRST_SEARCH_S)
@@ -105,7 +105,7 @@ class Fleet:
         await asyncio.gather(*self._closing, return_exceptions=True)
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Start work that continues even after the page that requested it is gone."""
+        """Start work that continues even after the page that requested it has disconnected."""
         start_task(work, self._begun)
 
     async def search(self) -> None:
@@ -136,12 +136,12 @@ class Fleet:
 
     @property
     def unreached(self) -> dict[str, str]:
-        """Names of drones that were found but are not connected and can't be commanded, with the reasons."""
+        """Names of drones that were found but are not connected and can't be commanded, each with the reason."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
     def let_go(self, name: str) -> None:
-        """Remove a drone; if it is found again, it reappears. Do nothing if the name is unknown."""
+        """Remove a drone; the drone reappears if it is found again. If the name is unknown, do nothing."""
         if name in self.stations:
             start_task(self.stations.pop(name).close(), self._closing)
 
@@ -158,12 +158,12 @@ class Fleet:
                 _log.warning("can't search for drones: %s", error)
 
     async def _join(self, found: Found) -> None:
-        # A drone may move to another host under the same name, where new connections will find it.
+        # A drone may move to another host under the same name; new connections will then find it there.
         found = found._replace(dial=lambda handler: self._found[found.name].dial(handler))
         try:
             drone = await asyncio.to_thread(self._connect, found)
         except SkyloopError as error:
-            self.problems[found.name] = str(error)  # will be retried in the next search
+            self.problems[found.name] = str(error)  # this will be retried in the next search
         else:
             self.problems.pop(found.name, None)
             self.stations[found.name] = Station(found, drone)
@@ -180,7 +180,7 @@ class Overview:
         self.broadcast = PeriodicBroadcast(period_s, self._make, lambda _: None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each drone, by name, including drones that were found but did not answer."""
+        """Return a row for each drone, by name, including drones that were found but did not respond."""
         recorded = self._recordings.drones()
         rows = []
         for name, station in self._fleet.stations.items():
@@ -247,7 +247,7 @@ class FleetSession:
             self._send({"type": "refused", "do": command.do, "n": command.n, "why": problem})
         else:
             stations = [station for _, station in sorted(self._fleet.stations.items()) if station.flies]
-            unreached = self._fleet.unreached  # a person who stops all drones must know which ones could not be reached
+            unreached = self._fleet.unreached  # a person who stops all drones must know which could not be reached
             names = sorted([*(station.found.name for station in stations), *unreached])
             self._send({"type": "sent", "do": command.do, "n": command.n, "drones": names})
             for name, why in unreached.items():

@@ -1,6 +1,6 @@
-"""Fly after a target that a person marked on a page: from the box to set-points and messages, on the event loop.
+"""Follow a target that a person marked on a page: from the box to set-points and messages, on the event loop.
 
-The content of a box is only tracked until the page sets a mode, either with the box or later
+The content of a box is only tracked until the page sets a mode, either together with the box or later
 (:meth:`FollowSession.fly`). In flight, each report from the :class:`~skyloop.cockpit.target_tracker.TargetTracker`
 yields one set-point; after :data:`STOPPED_S` without a new frame, the vehicle hovers until frames arrive again.
 """
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
 OLD_S: Final = 1.0  #: the vehicle also hovers if a frame is older than this when it is tracked
 OLD_FEEDBACK_S: Final = 1.0
-#: Maximum age of a request that may start a flight: by then the tracker is stuck, or nobody expects a flight any more.
+#: Maximum age of a request that may start a flight: when it is older, the tracker is stuck or nobody expects a flight.
 SET_OFF_S: Final = 10.0
-WATCH_S: Final = 0.1  #: interval between checks that the tracker still reports
+WATCH_S: Final = 0.1  #: interval between checks whether the tracker still reports
 NUMBERS_PERIOD_S: Final = 0.2  #: interval between messages that differ only in numbers
 JOIN_S: Final = 2.0
 NO_CONTROL: Final = "this page has lost control"
@@ -45,7 +45,7 @@ Json = dict[str, Any]
 
 
 class FollowerFactory(Protocol):
-    """Creates a follower for one target; called like :class:`skyloop.control.target_follower.TargetFollower`."""
+    """Creates a follower for one target, like :class:`skyloop.control.target_follower.TargetFollower`."""
 
     def __call__(
         self,
@@ -61,8 +61,8 @@ class FollowerFactory(Protocol):
 class FollowSession:
     """Tracks one target at a time for a page and follows it. Used on the event loop.
 
-    ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; called
-    before the first set-point. ``make``: creates followers; called on a thread.
+    ``drone``: provides the frames; may be connected as an observer. ``clear``: ends the page's other flights; it is
+    called before the first set-point. ``make``: creates followers; called on a worker thread.
     """
 
     def __init__(
@@ -78,19 +78,19 @@ class FollowSession:
         self._clear = clear
         self._make = make
         self._clock = clock
-        self._keeper: FrameKeeper | None = None  # set while a person draws a box
+        self._keeper: FrameKeeper | None = None  # not None while a person draws a box
         self._tracker: TargetTracker | None = None
         self._camera = ""
         self._mode = ""
         self._distance_m = 0.0
         self._limits: dict[str, Value] = {}  # the drone's limits, read when the target was marked
-        self._pilot: PilotConnection | None = None  # set while it is flying or about to fly
+        self._pilot: PilotConnection | None = None  # set while the vehicle is following or about to follow
         self._flying = False
-        self._waits = ""  # why it is currently hovering
+        self._waits = ""  # reason why it is currently hovering
         self._action: AnyAction | None = None  # the last set-point
         self._report: TrackReport | None = None
         self._reported_ns = 0
-        self._asked_ns = 0  # when the flight was requested
+        self._asked_ns = 0  # time at which the flight was requested
         self._last_sent: tuple[Any, ...] = ()
         self._last_sent_ns = 0
         self._watch: asyncio.TimerHandle | None = None
@@ -98,7 +98,7 @@ class FollowSession:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it commands the vehicle, or is about to."""
+        """Whether the session commands the vehicle, or is about to."""
         return self._pilot is not None
 
     # Requests from the page ------------------------------------------------------------------------------------
@@ -121,16 +121,16 @@ class FollowSession:
         )
 
     async def begin(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track the content of a box; with a mode, follow it once the tracker has caught up.
+        """Track the object inside a box; if a mode is given, follow it once the tracker has caught up.
 
         Args:
             command: The page's command.
-            held: Returns the connection that holds the authority; raises if there is none or a newer command was given.
-                Called only if a mode is given, at the beginning and before the flight.
+            held: Returns the connection that holds authority; raises if there is none or a newer command has been
+                given. Called only if a mode is given, first at the beginning and again before the flight.
 
         Raises:
-            AuthorityError: A mode was given, but this page does not hold the authority.
-            RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command was given.
+            AuthorityError: A mode was given, but this page does not hold authority.
+            RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command has been given.
             UsageError: The box, mode, distance or camera is invalid.
             MissingExtraError: OpenCV is not installed.
         """
@@ -148,7 +148,7 @@ class FollowSession:
         box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
         pilot = None if command.mode is None else held()
         self.end("another target was marked")
-        self._keeper = None  # owned by the tracker from now on
+        self._keeper = None  # from now on, the tracker owns the frame keeper
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
         self._distance_m = settings.distance_m
         settings = settings.within(self._limits)
@@ -167,9 +167,9 @@ class FollowSession:
         self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
-        """Follow the tracked target, or change the following mode.
+        """Follow the tracked target, or change the mode of following.
 
-        Raise ``RefusedError`` if nothing is tracked, or the vehicle is not in the air, or ``UsageError`` if the mode or
+        Raise ``RefusedError`` if nothing is tracked or the vehicle is not in the air, and ``UsageError`` if the mode or
         distance is invalid.
         """
         tracker = self._tracker
@@ -182,12 +182,12 @@ class FollowSession:
             tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
-        self._pilot, self._asked_ns = pilot, self._clock()  # the flight starts with the first report after catching up
+        self._pilot, self._asked_ns = pilot, self._clock()  # flight starts with the first report after catching up
         tracker.steers = True
         self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End a flight because another command was given or control was lost; tracking continues."""
+        """End the flight because another command was given or control was lost; tracking continues."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -195,7 +195,7 @@ class FollowSession:
         """Forget the target.
 
         ``why``: the reason shown on the page; empty if the person requested it. ``hover``: whether to hover if the
-        vehicle was following; False if another command is given.
+        vehicle was following; pass False if another command is given.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:
@@ -223,7 +223,7 @@ class FollowSession:
     # While tracking --------------------------------------------------------------------------------------------
 
     def _on_report(self, tracker: TargetTracker, report: TrackReport) -> None:
-        if tracker is not self._tracker:  # from a tracker that has ended
+        if tracker is not self._tracker:  # this report is from a tracker that has ended
             return
         self._report, self._reported_ns = report, self._clock()
         if report.problem or report.over:
@@ -241,7 +241,7 @@ class FollowSession:
 
     def _set_off(self) -> None:
         """Send the first set-point, ending any other flight."""
-        pilot, self._pilot = self._pilot, None  # so that clearing does not end this flight
+        pilot, self._pilot = self._pilot, None  # prevents clearing from ending this flight
         self._clear()
         self._pilot, self._flying, self._action = pilot, True, None
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
@@ -262,7 +262,7 @@ class FollowSession:
                     pilot.let_go(self._waits)
                 return
             if not pilot.command(action):
-                pilot.idle()  # otherwise it would still be carried out if the link were restored soon
+                pilot.idle()  # otherwise it would still be executed if the link were restored soon
                 raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
             self._action = action
         except AuthorityError:
@@ -271,7 +271,7 @@ class FollowSession:
             self.end(str(error))
 
     def _stopped(self) -> str:
-        """Return why flying is impossible (no frames, or unknown motion of the vehicle); empty if it is possible."""
+        """Return why flying is impossible (no frames, or the vehicle's motion is unknown); empty if it is possible."""
         report = self._report
         if report is None:
             return ""
@@ -285,7 +285,7 @@ class FollowSession:
         return ""
 
     def _on_watch(self) -> None:
-        """Hover if the tracker has not reported for too long, because its thread is stuck or starved."""
+        """Hover if the tracker has sent no report for too long because its thread is stuck or starved."""
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
         if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
             self._steer(None)
@@ -298,7 +298,7 @@ class FollowSession:
             self._send({"type": "follow", "state": "selecting", "camera": camera, "since_ns": str(since_ns)})
 
     def _send_state(self, state: str = "", why: str = "") -> None:
-        """Send the state: changes immediately, numbers at most once per :data:`NUMBERS_PERIOD_S`."""
+        """Send the state: changes immediately, and numbers at most once per :data:`NUMBERS_PERIOD_S`."""
         if not state:
             if self._tracker is None:
                 return
@@ -310,7 +310,7 @@ class FollowSession:
             phase = ""  # a control law that sends no set-points has no phase
         problem = why if state == "ended" or status is None else self._waits or status.problem
         now_ns = self._clock()
-        # While it waits, only the age increases, which is not a change.
+        # While the follower waits, only the age increases, which does not count as a change.
         sent = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
         if sent == self._last_sent and now_ns - self._last_sent_ns < nanoseconds(NUMBERS_PERIOD_S):
             return
@@ -333,7 +333,7 @@ class FollowSession:
 
 
 def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
-    """Convert a command's box to pixels of the frame, even if the page received the picture in another size."""
+    """Convert the box in a command to pixels of the frame, even if the page received the picture in another size."""
     x, y, width, height = command.box
     if command.size is None:
         return command.box
@@ -351,7 +351,7 @@ def _settings(distance_m: float | None) -> ChaseSettings:
 
 
 def _check_in_air(pilot: PilotConnection) -> Feedback:
-    """Return the newest feedback, checking that the vehicle is in the air and not flown by others."""
+    """Return the newest feedback after checking that the vehicle is in the air and not flown by another application."""
     feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
     if feedback.others:
         raise RefusedError(f"{feedback.others}: hover first to take it over")

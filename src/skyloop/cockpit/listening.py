@@ -1,10 +1,10 @@
 """Accept connections on the listening socket, and limit their number and how long they may be silent.
 
-A connection is *anonymous* until it has sent a request from an admitted person. The number of anonymous
-connections is limited, but a new one is always accepted: one from the address with the most connections is closed to
-make room, preferably one whose request was rejected, otherwise the oldest. A flood of strangers therefore displaces
-only itself, and people who send a request at once are served even during a flood. Connections of logged-in people have
-a separate limit, and some of them are reserved for pilots. These decisions take the time as an argument.
+A connection is *anonymous* until an admitted person has sent a request over it. The number of anonymous connections is
+limited, but a new connection is always accepted. To make room, a connection from the address with the most connections
+is closed, preferably one whose request was rejected, otherwise the oldest. A flood of strangers therefore displaces
+only itself, and people who send a request immediately are served even during a flood. Connections of logged-in people
+have a separate limit, and some of them are reserved for pilots. These decisions take the time as an argument.
 
 asyncio's own listener accepts connections until it runs out of descriptors, and then logs errors endlessly. This module
 therefore accepts connections itself and hands them to the HTTP server.
@@ -28,21 +28,21 @@ from skyloop.cockpit.access import Person
 from skyloop.cockpit.feeds import start_task
 from skyloop.messages import Role
 
-MAX_ANONYMOUS: Final = 128  #: enough for everyone to log in at the same time
-MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six connections, and several browsers may share an address
+MAX_ANONYMOUS: Final = 128  #: sufficient for everyone to log in at the same time
+MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six connections, and several browsers may share one address
 MAX_KNOWN: Final = 512  #: a page that shows a drone with two cameras has about eight
-MAX_KNOWN_OF_ADDRESS: Final = 192  #: limit per role; a whole classroom may share one address
-_PILOTS_SHARE: Final = 0.25  # fraction of the known connections reserved for pilots
+MAX_KNOWN_OF_ADDRESS: Final = 192  #: limit for each role; a whole classroom may share one address
+_PILOTS_SHARE: Final = 0.25  # fraction of the known connections that is reserved for pilots
 DESCRIPTORS_LEFT: Final = 128  #: descriptors reserved for drones, recordings, child processes and files
 
 HEADER_S: Final = 5.0  #: time limit for a TLS handshake and a whole request
-NEXT_S: Final = 10.0  #: time limit for the next request on a connection; the server closes idle ones sooner
-ANSWER_S: Final = 30.0  #: time limit for a stranger's request and its answer
+NEXT_S: Final = 10.0  #: time limit for the next request on a connection; the server closes idle connections sooner
+ANSWER_S: Final = 30.0  #: time limit for a stranger's request and the response to it
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """The number of connections of each kind that are allowed."""
+    """The maximum number of connections of each kind."""
 
     anonymous: int = MAX_ANONYMOUS
     anonymous_of_address: int = MAX_ANONYMOUS_OF_ADDRESS
@@ -51,12 +51,12 @@ class Places:
 
     @property
     def observers(self) -> int:
-        """The known connections available to observers; the others are reserved for pilots."""
+        """The number of known connections available to observers; the rest are reserved for pilots."""
         return self.known - round(self.known * _PILOTS_SHARE)
 
     @classmethod
     def within(cls, descriptors: int) -> Places:
-        """Return the limits for a process that may open this many descriptors."""
+        """Return the limits for a process that may open this number of descriptors."""
         share = min(1.0, max(descriptors - DESCRIPTORS_LEFT, descriptors // 4) / (MAX_ANONYMOUS + MAX_KNOWN))
         most = (MAX_ANONYMOUS, MAX_ANONYMOUS_OF_ADDRESS, MAX_KNOWN, MAX_KNOWN_OF_ADDRESS)
         return cls(*(max(1, int(number * share)) for number in most))
@@ -64,18 +64,18 @@ class Places:
 
 @dataclass(eq=False, slots=True)
 class Connection:
-    """An open connection. ``end`` closes it at once; ``person`` is who was admitted over it."""
+    """An open connection. ``end`` closes the connection immediately; ``person`` is who was admitted over it."""
 
     address: str
     end: Callable[[], None]
     person: Person | None = None
-    deadline_ns: int | None = None  #: closed if nothing happens by this time
-    asked: bool = False  #: whether a request from a stranger has arrived on it
+    deadline_ns: int | None = None  #: the connection is closed if nothing happens by this time
+    asked: bool = False  #: whether a stranger's request has arrived on it
 
 
 @dataclass(slots=True)
 class AdmissionCounts:
-    """Counts since the start."""
+    """Counts since startup."""
 
     displaced: int = 0  #: anonymous connections closed in favour of newer ones
     timed_out: int = 0  #: connections closed because they were silent
@@ -90,7 +90,7 @@ class Admission:
     counts: AdmissionCounts = field(default_factory=AdmissionCounts)
 
     def __post_init__(self) -> None:
-        self._anonymous: dict[str, dict[Connection, None]] = {}  # by address, oldest first
+        self._anonymous: dict[str, dict[Connection, None]] = {}  # keyed by address, oldest first
         self._known: dict[Connection, None] = {}
 
     @property
@@ -100,11 +100,11 @@ class Admission:
 
     @property
     def known(self) -> int:
-        """The number of open connections of known people."""
+        """The number of open connections from known people."""
         return len(self._known)
 
     def opened(self, connection: Connection, now_ns: int) -> None:
-        """Add a new connection, and close the connection whose place it takes, if any."""
+        """Add a new connection. If it replaces another connection, close the old one."""
         if len(self._anonymous.get(connection.address, ())) >= self.places.anonymous_of_address:
             self._displace(connection.address)
         elif self.anonymous >= self.places.anonymous:
@@ -113,14 +113,14 @@ class Admission:
         connection.deadline_ns = now_ns + nanoseconds(HEADER_S)
 
     def shed(self) -> None:
-        """Close an anonymous connection from the address that has the most."""
+        """Close an anonymous connection from the address that has the most anonymous connections."""
         if self._anonymous:
             self._displace(max(self._anonymous, key=lambda address: len(self._anonymous[address])))
 
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
-        """Record that a complete request arrived.
+        """Record that a complete request has arrived.
 
-        ``person``: who sent it; None for a stranger. Return why the request is refused; empty if it is not.
+        ``person``: the sender, or None for a stranger. Return why the request is refused, or "" if it is accepted.
         """
         if person is None:
             connection.asked = True
@@ -138,7 +138,7 @@ class Admission:
         return ""
 
     def answered(self, connection: Connection, now_ns: int) -> None:
-        """Record that the answer was sent and the connection waits for its next request."""
+        """Record that the answer was sent and that the connection is waiting for its next request."""
         connection.deadline_ns = now_ns + nanoseconds(NEXT_S)
 
     def closed(self, connection: Connection) -> None:
@@ -150,7 +150,7 @@ class Admission:
             self._anonymous.pop(connection.address, None)
 
     def end_overdue(self, now_ns: int) -> None:
-        """Close the connections that have been silent for too long."""
+        """Close connections that have been silent for too long."""
         everybody = [*self._known, *(one for connections in self._anonymous.values() for one in connections)]
         for connection in everybody:
             if connection.deadline_ns is not None and now_ns >= connection.deadline_ns:
@@ -158,7 +158,7 @@ class Admission:
                 self._end(connection)
 
     def _full(self, connection: Connection, person: Person) -> str:
-        """Return why this person gets no further connection from this address; empty if one is allowed."""
+        """Return why this person may not open another connection from this address; empty if one is allowed."""
         role, places = person.role, self.places
         roles = Counter(one.person.role for one in self._known if one.person is not None and one is not connection)
         here = sum(
@@ -176,8 +176,8 @@ class Admission:
         return ""
 
     def _displace(self, address: str) -> None:
-        # Connections on which a stranger's request has arrived, such as a wrong token, are closed first. Otherwise a
-        # guesser, whose answers are delayed, could cut off the handshakes of people at the same address.
+        # Connections on which a stranger's request arrived, such as one with a wrong token, are closed first. Otherwise
+        # a guesser, whose responses are delayed, could displace the handshakes of people at the same address.
         self.counts.displaced += 1
         of_address = self._anonymous[address]
         self._end(next((one for one in of_address if one.asked), next(iter(of_address))))
@@ -187,13 +187,13 @@ class Admission:
         connection.end()
 
 
-BACKLOG: Final = 1024  #: connections queued by the kernel; a client retries a dropped one after 1 s
-AT_ONCE: Final = 16  #: number of connections accepted before open ones are served again
+BACKLOG: Final = 1024  #: maximum number of connections queued by the kernel; a client retries a dropped one after 1 s
+AT_ONCE: Final = 16  #: number of connections accepted before existing ones are served again
 PAUSE_S: Final = 0.1  #: pause after the system refused a connection for lack of resources
-SWEEP_S: Final = 0.5  #: interval between sweeps that close silent connections
+SWEEP_S: Final = 0.5  #: interval between the checks that close silent connections
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
-_MAX_MESSAGES: Final = 256  # messages remembered by a filter; enough, because the program has fewer kinds
+_MAX_MESSAGES: Final = 256  # number of messages a filter remembers; the program has fewer kinds of messages
 
 _log = logging.getLogger(__name__)
 
@@ -214,7 +214,7 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as long as the admission has room. Used on the event loop."""
+    """Accepts connections while :meth:`run` is running, as long as the admission has room. Used on the event loop."""
 
     def __init__(
         self,
@@ -232,7 +232,7 @@ class Listener:
         self._handing_over: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Accept connections until cancelled. Open connections stay open."""
+        """Accept connections until cancelled. Connections that are already open stay open."""
         self._listening.setblocking(False)
         self._listening.listen(BACKLOG)
         sweeping = asyncio.create_task(self._sweep())
@@ -255,12 +255,12 @@ class Listener:
                 if error.errno in _NO_ROOM:
                     self._admission.shed()
                     _log.warning("can't accept connections: %s", error.strerror)
-                # Other errors only affect the connection being accepted, which is gone.
+                # Other errors affect only the connection that was being accepted, which is already gone.
                 await asyncio.sleep(PAUSE_S if error.errno in _NO_ROOM else 0)
                 continue
             self._open(bare, str(address[0]))
             taken += 1
-            if taken % AT_ONCE == 0:  # a flood must not keep pages waiting
+            if taken % AT_ONCE == 0:  # a flood of connections must not keep pages waiting
                 await asyncio.sleep(0)
 
     def _open(self, bare: socket.socket, address: str) -> None:
@@ -278,7 +278,7 @@ class Listener:
                 lambda: self._protocol(connection), accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s
             )
         except OSError:
-            accepted.close()  # the handshake failed, or the client has disconnected
+            accepted.close()  # the handshake failed or the client has disconnected
         except BaseException:
             accepted.close()
             raise
@@ -290,7 +290,7 @@ class Listener:
 
 
 def places_here() -> Places:
-    """Return the limits that suit this process's descriptor limit."""
+    """Return the limits that suit the descriptor limit of this process."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -300,29 +300,29 @@ def places_here() -> Places:
 
 
 def _shut(accepted: socket.socket) -> None:
-    """Shut a connection down, so that its protocol or the handshake reads the end of file and closes it."""
+    """Shut down a connection, so that its protocol or the handshake reads the end of file and closes the connection."""
     with suppress(OSError):  # already closed
         accepted.shutdown(socket.SHUT_RDWR)
 
 
 def limit_messages() -> None:
-    """Limit the log messages that strangers can cause to one of each kind per period."""
+    """Limit the log messages that strangers can cause to one message of each kind per period."""
     for name in (__name__, "uvicorn.error", "asyncio"):
         logging.getLogger(name).addFilter(_REPEATS)
 
 
 class RepeatLimit(logging.Filter):
-    """A log filter that passes each message once per ``every_s`` [s], with the number of repeats that were dropped.
+    """A log filter that passes each message at most once per ``every_s`` [s] and adds the number of suppressed repeats.
 
-    Messages that differ only in their values count as equal. The filter remembers 256 messages and first forgets the
-    one that it passed longest ago.
+    Messages that differ only in their values are considered equal. The filter remembers 256 messages, and first forgets
+    the message that it passed longest ago.
     """
 
     def __init__(self, every_s: float = 10.0, clock: Clock = monotonic_ns) -> None:
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # time and number dropped since, by message without values
+        self._logged: dict[str, tuple[int, int]] = {}  # time, and repeats dropped since, by message without values
 
     def filter(self, record: logging.LogRecord) -> bool:
         key, now_ns = f"{record.name} {record.msg}", self._clock()
@@ -332,7 +332,7 @@ class RepeatLimit(logging.Filter):
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        self._logged.pop(key, None)  # so that messages are ordered by when they were last passed
+        self._logged.pop(key, None)  # keeps messages ordered by when they were last passed
         if len(self._logged) >= _MAX_MESSAGES:
             del self._logged[next(iter(self._logged))]
         self._logged[key] = now_ns, 0

@@ -1,6 +1,6 @@
-"""One page's flights to a place, back to the start or along a route: how they are commanded and how they end.
+"""One page's flights to a place, back to the start, or along a route: how they are commanded and how they end.
 
-:class:`skyloop.control.route_law.RouteLaw` decides how a route is flown. Everything runs on the event loop.
+:class:`skyloop.control.route_law.RouteLaw` determines how a route is flown. Everything runs on the event loop.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: maximum speed on the way to a place
-PERIOD_S: Final = 0.05  #: interval between checks for arrival
+PERIOD_S: Final = 0.05  #: interval between checks whether the drone has arrived
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A flight to one place."""
+    """A flight to a single place."""
 
     action: Position | ReturnToStart  #: the command to send
     goal: Waypoint  #: the place to fly to
@@ -40,10 +40,10 @@ class Leg:
 
 
 def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
-    """Plan a flight to the place given in a command.
+    """Plan a flight to the place specified in a command.
 
     Raise ``RefusedError`` if the vehicle can't currently be flown to places, ``UsageError`` if a coordinate is out of
-    range, or ``LinkError`` if no feedback has been received.
+    range, and ``LinkError`` if no feedback has been received.
     """
     _fit_for_places(pilot, "it can't be flown to a place")
     goal = Waypoint(command.x, command.y, command.z, command.yaw)
@@ -54,7 +54,7 @@ def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
 def to_start(pilot: PilotConnection) -> Leg:
     """Plan a flight back to the take-off position.
 
-    Raise ``RefusedError`` if the vehicle can't currently be flown to places, or its take-off position is unknown, or
+    Raise ``RefusedError`` if the vehicle can't currently be flown to places or its take-off position is unknown, and
     ``LinkError`` if no feedback has been received.
     """
     start = _fit_for_places(pilot, "it can't return to its start").start_position_m
@@ -69,10 +69,10 @@ def to_start(pilot: PilotConnection) -> Leg:
 
 
 class PlaceFlight:
-    """Monitors one flight to a place at a time, and shows its goal.
+    """Monitors flights to a place, one at a time, and shows the goal.
 
-    A flight ends on arrival or at the first problem. ``done``: called on arrival, with the command's kind and number.
-    ``refused``: called if the flight ended before arrival, with the command's kind and number, and the reason.
+    A flight ends on arrival or when the first problem occurs. ``done``: called on arrival, with the command's kind and
+    number. ``refused``: called if the flight ends before arrival, with the command's kind and number, and the reason.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class PlaceFlight:
         self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
-        """Stop monitoring, because another command was given."""
+        """Stop monitoring, because another command has been given."""
         self._station.goals.pop(self._app, None)
         if self._job is not None:
             self._job.cancel()
@@ -133,7 +133,7 @@ def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
     return feedback
 
 
-OLD_S: Final = 1.0  #: a route is paused if feedback is older than this
+OLD_S: Final = 1.0  #: a route is paused if the feedback is older than this
 
 
 class RouteSession:
@@ -160,19 +160,19 @@ class RouteSession:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it currently commands the vehicle."""
+        """Whether the route currently commands the vehicle."""
         return self.law.is_under_way
 
     def begin(self) -> None:
         """Fly to the first waypoint, and monitor the flight in a task until :meth:`end`.
 
-        Raise ``SkyloopError`` if the drone is on the ground, its position is unknown, or the command was not sent.
+        Raise ``SkyloopError`` if the drone is on the ground, its position is unknown, or the command could not be sent.
         """
         self._carry_out(self.law.start(self._pilot.feedback(max_age_s=OLD_S)))
         self._job = asyncio.create_task(self._watch())
 
     def pause(self, why: str = "", *, hover: bool = True) -> None:
-        """Pause. ``hover``: False if another command was given or control was lost."""
+        """Pause. ``hover``: pass False if another command was given or control was lost."""
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
@@ -227,13 +227,13 @@ class RouteSession:
 
     def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
-        if automatic and not isinstance(action, Position):  # the end of the route, not a person, caused it
+        if automatic and not isinstance(action, Position):  # this was caused by the end of the route, not by a person
             pilot.let_go("its route ended", land=isinstance(action, Land))
             return
         if pilot.command(action):
             return
         with suppress(SkyloopError):
-            pilot.idle()  # otherwise it would still be carried out if the link were restored soon
+            pilot.idle()  # otherwise the vehicle would still carry it out if the link came back soon
         raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
 
     def _send_progress(self, step: Progress) -> None:

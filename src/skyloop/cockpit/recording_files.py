@@ -1,7 +1,7 @@
-"""The files in the recordings folder: rename, annotate, move to the trash and restore. Blocking.
+"""The files in the recordings folder: rename and annotate them, move them to the trash and restore them. Blocking.
 
 Notes on ``flight.mcap`` are stored next to it in ``flight.notes.json``. Deleted recordings are moved to the folder
-``trash`` until that is emptied. No file is ever overwritten.
+``trash``, where they stay until the trash is emptied. No file is ever overwritten.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Mark(msgspec.Struct, frozen=True):
 
 
 class Notes(msgspec.Struct, frozen=True):
-    """The notes that people have written about a recording."""
+    """The notes people have written about a recording."""
 
     text: str = ""
     marks: tuple[Mark, ...] = ()
@@ -81,10 +81,10 @@ def read_notes(path: Path) -> Notes:
 
 
 def write_text(path: Path, text: str) -> Notes:
-    """Write a recording's note; an empty note is removed.
+    """Write a recording's note; an empty note removes the existing one.
 
-    Raise ``UsageError`` if the note is too long or can't be written, or ``FileFormatError`` if the existing notes file
-    can't be read and is therefore not overwritten.
+    Raise ``UsageError`` if the note is too long or can't be written, and ``FileFormatError`` if the existing notes file
+    can't be read, in which case it is not overwritten.
     """
     if len(text) > MAX_TEXT:
         raise UsageError(f"a note has at most {MAX_TEXT} characters, not {len(text)}")
@@ -94,7 +94,7 @@ def write_text(path: Path, text: str) -> Notes:
 def add_mark(path: Path, at_s: float, text: str) -> Notes:
     """Add a mark to a recording.
 
-    Raise ``UsageError`` if the position is invalid, the text too long, or there are too many marks.
+    Raise ``UsageError`` if the position is invalid, the text is too long, or there are too many marks.
     """
     if not (math.isfinite(at_s) and 0.0 <= at_s <= MAX_AT_S):
         raise UsageError(f"a mark is at 0 to {MAX_AT_S:g} s of the recording, not at {at_s!r}")
@@ -118,7 +118,7 @@ def remove_mark(path: Path, mark: Mark) -> Notes:
 
 
 def check_mark(text: str) -> None:
-    """Check the text of a mark. Raise ``UsageError`` if the text is too long."""
+    """Check that the text of a mark is valid. Raise ``UsageError`` if the text is too long."""
     if len(text) > MAX_MARK:
         raise UsageError(f"a mark has at most {MAX_MARK} characters, not {len(text)}")
 
@@ -126,7 +126,7 @@ def check_mark(text: str) -> None:
 def rename(path: Path, name: str) -> str:
     """Rename a recording and its notes.
 
-    Raise ``UsageError`` if the name is invalid, or the file can't be moved, or ``RefusedError`` if a file with that
+    Raise ``UsageError`` if the name is invalid or the file can't be moved, and ``RefusedError`` if a file with that
     name already exists.
     """
     target = path.with_name(check_name(name))
@@ -138,8 +138,8 @@ def rename(path: Path, name: str) -> str:
 def throw_away(path: Path) -> str:
     """Move a recording and its notes to the trash.
 
-    Return the recording's name in the trash, with a number if its own name was taken. Raise ``UsageError`` if a file
-    can't be moved.
+    Return the recording's name in the trash, with a number appended if its own name is taken. Raise ``UsageError`` if a
+    file can't be moved.
     """
     trash = path.parent / TRASH
     try:
@@ -156,8 +156,8 @@ def throw_away(path: Path) -> str:
 def bring_back(folder: Path, name: str) -> str:
     """Move a recording and its notes from the trash back into the folder.
 
-    Raise ``UnknownNameError`` if the recording is not in the trash, ``RefusedError`` if a file with that name already
-    exists in the folder, or ``UsageError`` if a file can't be moved.
+    Raise ``UnknownNameError`` if the recording is not in the trash, ``RefusedError`` if the folder already has a file
+    with that name, and ``UsageError`` if a file can't be moved.
     """
     thrown = {path.name: path for path in _recordings(folder / TRASH)}
     if name not in thrown:

@@ -1,8 +1,8 @@
-"""Recordings on the page: start, stop, list, replay and report on them.
+"""Recordings on the page: start, stop, list and replay them, and create reports on them.
 
-Recorders, reports and replays each run in their own process, so that they neither disturb flights nor block the event
-loop; the process of a replay is a private proxy. All of them end when this process ends for any reason. The number of
-each is limited, and they start one at a time.
+Recorders, reports and replays each run in their own process, so they neither disturb flights nor block the event loop;
+a replay's process is a private proxy. All of these processes end when this process ends for any reason. The number of
+each is limited, and they are started one at a time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from skyloop.recording.reader import Recording
 
 
-REPLAY_S: Final = 60.0  #: time limit for a replay's proxy to start, which is slow on a busy computer
+REPLAY_S: Final = 60.0  #: time limit for the start of a replay's proxy, which is slow on a busy computer
 
 
 class Recorder(Protocol):
@@ -74,9 +74,9 @@ def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
 
 
 def start_replay(path: Path, drone: str | None = None) -> Drone:
-    """Start a private proxy that plays a file, and connect to it.
+    """Start a private proxy that plays a file, and connect to the proxy.
 
-    ``drone``: the recorded drone to play; None for the first.
+    ``drone``: the recorded drone to play, or None for the first drone.
     """
     from skyloop.client import connect
 
@@ -96,7 +96,7 @@ class Replay:
 
     drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
-    recorded: str | None  #: the drone's name in the recording; None for the first one
+    recorded: str | None  #: the drone's name in the recording; None for the first drone
 
 
 def progress(status: Status) -> dict[str, Any]:
@@ -115,9 +115,9 @@ def progress(status: Status) -> dict[str, Any]:
 Json = dict[str, Any]
 T = TypeVar("T")
 
-MAX_CHILDREN: Final = 8  #: maximum number of simultaneous recordings, and of replays; each is a process
+MAX_CHILDREN: Final = 8  #: maximum number of simultaneous recordings, and of replays; each one is a process
 MOST_LISTED: Final = 500
-NOTE_SHOWN: Final = 200  #: number of characters of a note shown in the list
+NOTE_SHOWN: Final = 200  #: maximum number of characters of a note that the list shows
 
 
 class Recordings:
@@ -139,7 +139,7 @@ class Recordings:
         self._replay = replay
         self.reports = Reports()
         self._timelines = Reports(timeline_command, "time line")
-        self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, newest last
+        self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, from oldest to newest
         self._changing = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._looking = asyncio.Lock()
@@ -154,7 +154,7 @@ class Recordings:
     async def start(self, drones: Sequence[str]) -> Json:
         """Start recording.
 
-        Raise ``UsageError`` if no drone was given, or the folder can't be created, or ``RefusedError`` if
+        Raise ``UsageError`` if no drone was given or the folder can't be created, and ``RefusedError`` if
         :data:`MAX_CHILDREN` recordings are already running.
         """
         if not drones:
@@ -186,15 +186,15 @@ class Recordings:
     async def listing(self) -> Json:
         """Return the running recordings and those in the folder, newest first."""
         running = [self._entry(number) for number in self._running]
-        async with self._looking:  # simultaneous requests cost no more than one
+        async with self._looking:  # several simultaneous requests cost no more than one
             past = await asyncio.to_thread(self._past)
             trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
         return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
 
     def mark(self, number: str, text: str) -> tuple[str, ...]:
-        """Check a mark for a running recording and return the drones it applies to.
+        """Check a mark for a running recording and return the drones to which it applies.
 
-        Raise ``UnknownNameError`` if no such recording is running, or ``UsageError`` if the text is too long.
+        Raise ``UnknownNameError`` if no such recording is running, and ``UsageError`` if the text is too long.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -206,14 +206,14 @@ class Recordings:
     async def path(self, name: str) -> Path:
         """Return the path of a recording.
 
-        Raise ``UnknownNameError`` if the file does not exist, or is being recorded.
+        Raise ``UnknownNameError`` if the file does not exist or is being recorded.
         """
         return await asyncio.to_thread(self._path, name)
 
     async def move(self, name: str, change: Callable[[Path], str]) -> str:
-        """Rename or delete a recording that is neither being written nor replayed; return its new name.
+        """Rename or delete a recording that is neither being written nor replayed; return the recording's new name.
 
-        Raise ``UnknownNameError`` if the file does not exist, or ``RefusedError`` if the recording is in use, or
+        Raise ``UnknownNameError`` if the file does not exist, and ``RefusedError`` if the recording is in use or
         ``change`` refuses.
         """
         async with self._starting, self._changing:
@@ -243,7 +243,7 @@ class Recordings:
 
         Args:
             name: The file's name in the folder.
-            recorded: The recorded drone to play; None for the first.
+            recorded: The recorded drone to play, or None to play the first drone.
 
         Returns:
             The name of the replay's proxy.
@@ -261,10 +261,10 @@ class Recordings:
             return drone.name
 
     async def replayed(self, name: str) -> Json:
-        """Return the recording's data for the page's replay bar.
+        """Return the data of the recording that the page's replay bar needs.
 
-        Return the file's name, the result of :func:`skyloop.cockpit.recordings.timeline`, and the notes, as JSON
-        values. Raise ``UnknownNameError`` if no such replay was started here.
+        Return the file's name, the result of :func:`skyloop.cockpit.recordings.timeline` and the notes, as JSON values.
+        Raise ``UnknownNameError`` if no such replay was started here.
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
@@ -302,7 +302,7 @@ class Recordings:
         return known[name]
 
     def _files(self) -> list[Path]:
-        """Return the recordings in the folder, except those being written here."""
+        """Return the recordings in the folder, except for those being written here."""
         written = {
             Path(file).name for running in list(self._running.values()) for file in running.recorder.status.files
         }
@@ -332,7 +332,7 @@ class Recordings:
 
 
 def _noted(path: Path) -> Json:
-    """Return the beginning of a recording's notes, to show in its row."""
+    """Return the beginning of a recording's notes, which is shown in the recording's row."""
     try:
         notes = recording_files.read_notes(path)
     except FileFormatError as error:
@@ -350,17 +350,17 @@ def _check_number(what: str, end: str, running: int) -> None:
 
 REPORT: Final = "report"
 TIMELINE: Final = "timeline"
-REPORT_S: Final = 120.0  #: time limit for one report
-MAX_WAITING: Final = 4  #: maximum number of waiting requests; a longer queue would take minutes
+REPORT_S: Final = 120.0  #: time limit for creating one report
+MAX_WAITING: Final = 4  #: maximum number of waiting requests; a longer queue would take minutes to process
 NICENESS: Final = 10  #: niceness of the child: pages and flights have priority over reports
-_TAKEN: Final = 4096  # bytes kept from a child's error output
+_TAKEN: Final = 4096  # number of bytes kept from a child's error output
 
-#: Function that returns the command for a report on a file, given the file, the target and optionally one drone.
+#: Function that returns the command line for a report on a file, given the file, the target and optionally one drone.
 Command = Callable[[Path, Path, str | None], Sequence[str]]
 
 
 def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the command for the child that creates a report."""
+    """Return the command line of the child process that creates a report."""
     return _child(REPORT, file, target, drone)
 
 
@@ -370,7 +370,7 @@ def timeline_command(file: Path, target: Path, drone: str | None) -> Sequence[st
 
 
 def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return a command that runs this module as a program."""
+    """Return a command line that runs this module as a program."""
     return [
         sys.executable,
         "-m",
@@ -383,12 +383,12 @@ def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[s
 
 
 class Reports:
-    """Creates reports or other products of recordings in child processes. Used on the event loop.
+    """Creates reports and other products of recordings in child processes. Used on the event loop.
 
-    A report keeps a core busy for seconds, and any observer may request one. Requests therefore wait in a short queue
-    and are refused when it is full. If a client disconnects, its request leaves the queue or its child is ended.
-    ``command``: returns the child's command line; by default :func:`child_command`. ``what``: the name of the product
-    in error messages.
+    A report keeps a CPU core busy for seconds, and any observer may request one. Requests therefore wait in a short
+    queue and are refused when it is full. If a client disconnects, its request is removed from the queue or its child
+    is ended. ``command``: returns the child's command line; by default :func:`child_command`. ``what``: name of the
+    child's output in error messages.
     """
 
     def __init__(self, command: Command | None = None, what: str = "report") -> None:
@@ -398,19 +398,19 @@ class Reports:
         self._wanted = 0  # number of reports in progress or queued
 
     async def make(self, file: Path, drone: str | None = None) -> str:
-        """Create a report; if cancelled, leave nothing behind.
+        """Create a report; if this is cancelled, leave nothing behind.
 
         Args:
             file: The recording.
-            drone: The recorded drone; None for the only one.
+            drone: The recorded drone, or None if there is only one.
 
         Returns:
-            The child's output: a page like that of ``skyloop log report``.
+            The child's output, which is a page like that of ``skyloop log report``.
 
         Raises:
             RefusedError: The queue is full.
-            UsageError: The child failed; its message is included.
-            LinkError: Creating it took longer than :data:`REPORT_S`.
+            UsageError: The child failed; the error contains its message.
+            LinkError: Creating the report took longer than :data:`REPORT_S`.
         """
         if self._wanted > MAX_WAITING:
             raise RefusedError(
@@ -429,7 +429,7 @@ class Reports:
             target = Path(folder) / "report.html"
             child = await asyncio.create_subprocess_exec(
                 *self._command(file.absolute(), target, drone),
-                stdin=asyncio.subprocess.PIPE,  # closed when this process ends
+                stdin=asyncio.subprocess.PIPE,  # closed when this process ends, which ends the child
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,
             )
@@ -453,10 +453,10 @@ class Reports:
 
 
 def run_child(arguments: Sequence[str]) -> int:
-    """Write a report or timeline, unless standard input closes first, which means that the requester is gone.
+    """Write a report or timeline, unless standard input closes first, which means that the requester has exited.
 
-    ``arguments``: ``report`` or ``timeline``, FILE TARGET [DRONE], from the command line. Return the exit code: 0, or 2
-    with a line of explanation.
+    ``arguments``: ``report`` or ``timeline``, then FILE TARGET [DRONE], from the command line. Return the exit code: 0,
+    or 2 after printing a line of explanation.
     """
     os.nice(NICENESS)
     on_parent_end(partial(os._exit, 1))
@@ -480,7 +480,7 @@ def _report(recording: Recording, drone: str, target: Path) -> None:
 
 
 MARK: Final = "mark"  #: name under which marks are logged
-MAX_EVENTS: Final = 300  #: if there are more, the most severe are kept
+MAX_EVENTS: Final = 300  #: if there are more events, the most severe are kept
 MAX_MARKS: Final = 300
 MAX_SAMPLES: Final = 1200
 PERIOD_S: Final = 0.1  #: minimum time between samples

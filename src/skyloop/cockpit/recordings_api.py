@@ -1,4 +1,4 @@
-"""Requests about recordings and replays. Observers may read, watch and download; pilots may also make changes."""
+"""Requests about recordings and replays. Observers may read, watch and download; pilots may also change things."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REPORT_POLICY: Final = (
 )
 #: A replay's parameters, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = 16_384  #: maximum length of any text in a request; lower limits are checked where it is used
+_MOST_CHARACTERS: Final = 16_384  #: maximum length of a text in a request; lower limits are checked at the point of use
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -88,7 +88,7 @@ class RecordingsApi:
 
     @answered
     async def recordings(self, _: Request) -> Response:
-        """Answer with the running and finished recordings."""
+        """Respond with the running and finished recordings."""
         return answer_json(await self._recordings.listing())
 
     @answered
@@ -117,20 +117,20 @@ class RecordingsApi:
 
     @answered
     async def file(self, request: Request) -> Response:
-        """Answer with a recording's file, or with the requested range of it."""
+        """Respond with a recording's file, or with the requested range of that file."""
         path = await self._recordings.path(request.path_params["name"])
         return FileResponse(path, filename=path.name, media_type="application/octet-stream")
 
     @answered
     async def report(self, request: Request) -> Response:
-        """Answer with the report on a recording, as a page."""
+        """Respond with the report on a recording, as a page."""
         path = await self._recordings.path(request.path_params["name"])
         page = await while_wanted(request, self._recordings.reports.make(path, request.query_params.get("drone")))
         return HTMLResponse(page, headers={"content-security-policy": _REPORT_POLICY})
 
     @answered
     async def notes(self, request: Request) -> Response:
-        """Answer with the notes of a recording."""
+        """Respond with the notes of a recording."""
         path = await self._recordings.path(request.path_params["name"])
         return answer_json(await asyncio.to_thread(recording_files.read_notes, path))
 
@@ -187,7 +187,7 @@ class RecordingsApi:
 
     @answered
     async def replayed(self, request: Request) -> Response:
-        """Answer with the timeline and notes of a replay's recording."""
+        """Respond with the timeline and notes of a replay's recording."""
         return answer_json(await while_wanted(request, self._recordings.replayed(request.path_params["name"])))
 
     @answered
@@ -199,9 +199,9 @@ class RecordingsApi:
         if not station.drone.uri.startswith("replay:"):
             raise UsageError(f"{name} is not a replay: only replays can be paused or repositioned")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
-        # Pause before changing the position, and resume after it: otherwise it would continue from the old position.
+        # Pause before changing the position and resume after it; otherwise it continues from the old position.
         values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
-        pilot = await station.stopper()  # a pilot's connection; this needs no authority
+        pilot = await station.stopper()  # a connection for a pilot, used here without authority
         for parameter, value in values.items():
             if value is not None:
                 await asyncio.to_thread(pilot.config.__setitem__, parameter, value)

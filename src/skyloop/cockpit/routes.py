@@ -30,14 +30,14 @@ class RouteFiles:
         self.folder = folder
 
     def listing(self) -> Json:
-        """Return the routes as JSON values, by name; for an unreadable file, give the problem instead."""
+        """Return the routes as JSON values, by name; for an unreadable file, return the problem instead."""
         files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
         return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
 
     def load(self, name: str) -> Route:
         """Read a route.
 
-        Raise ``UnknownNameError`` if there is no route with that name, or ``SkyloopError`` if the file can't be read.
+        Raise ``UnknownNameError`` if there is no route with that name, and ``SkyloopError`` if the file can't be read.
         """
         path = self._path(name)
         if not path.is_file():
@@ -45,9 +45,9 @@ class RouteFiles:
         return load_route(path)
 
     def save(self, name: str, route: Route) -> None:
-        """Write a route, replacing any with the same name.
+        """Write a route, replacing any route with the same name.
 
-        Raise ``UsageError`` if the name is invalid, or the file can't be written, or ``RefusedError`` if there are
+        Raise ``UsageError`` if the name is invalid or the file can't be written, and ``RefusedError`` if there are
         already :data:`MOST_FILES` routes.
         """
         path = self._path(name)
@@ -62,7 +62,7 @@ class RouteFiles:
     def delete(self, name: str) -> None:
         """Delete a route.
 
-        Raise ``UnknownNameError`` if there is no route with that name, or ``UsageError`` if the name is invalid, or the
+        Raise ``UnknownNameError`` if there is no route with that name, and ``UsageError`` if the name is invalid or the
         file can't be deleted.
         """
         path = self._path(name)
@@ -90,13 +90,13 @@ class RouteFiles:
 
 
 class CheckedRoutes:
-    """One drone's most recently checked routes, by a hash of their content, so that only checked routes are flown."""
+    """One drone's most recently checked routes, by a hash of their content; only checked routes can be flown."""
 
     def __init__(self) -> None:
         self._routes: OrderedDict[str, Route] = OrderedDict()
 
     def add(self, route: Route, check: RouteCheck) -> Json:
-        """Keep a route; return the check's findings as JSON values, with the ``id`` by which to fly the route."""
+        """Store a route; return the check's findings as JSON values, with the ``id`` used to fly the route."""
         number = hashlib.sha256(checked(route).to_json()).hexdigest()[:16]
         self._routes[number] = route
         self._routes.move_to_end(number)
@@ -107,7 +107,7 @@ class CheckedRoutes:
     def get(self, number: str) -> Route:
         """Return a checked route.
 
-        Raise ``RefusedError`` if the route was not checked, or too many others have been checked since.
+        Raise ``RefusedError`` if the route was not checked, or if too many other routes have been checked since.
         """
         if number not in self._routes:
             raise RefusedError("this route was not checked recently: check it again")

@@ -1,13 +1,13 @@
-"""Decide which requests are answered, from the page they come from and the person who sent them. Guards all routes.
+"""Decide which requests are answered, based on the page they come from and the person who sent them. Guards all routes.
 
 A page from another site can make a browser send requests to this server. Three checks prevent that. The ``Host`` header
-must name this server, to prevent DNS rebinding. The ``Origin`` must be that of this page: browsers add it to every
-WebSocket and every request that changes something, and pages can't forge it. A link has no origin, but
-``Sec-Fetch-Site`` shows where it comes from: a link from another site may only lead to the page itself. Finally, the
+must name this server, to prevent DNS rebinding. The ``Origin`` must be that of this page: browsers add this header to
+every WebSocket and every request that changes something, and pages can't forge it. A link has no origin, but
+``Sec-Fetch-Site`` reveals where it comes from: a link from another site may lead only to the page itself. Finally, the
 page may load only its own files and can't be framed (Content-Security-Policy).
 
-After these checks the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
-needs: observer by default, pilot for routes that change something.
+After these checks, the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role that each route
+needs: observer by default, or pilot for routes that change something.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skyloop.messages import Role
 
 LOG_IN: Final = 4401  #: WebSocket close code: not logged in
 NOT_ALLOWED: Final = 4403  #: WebSocket close code: only a pilot may do this
-ADMIT: Final = "admit"  #: key of a function in the connection's state that returns why a person is refused
+ADMIT: Final = "admit"  #: key of the connection's state under which a function returns why a person is refused
 _FOREIGN: Final = 1008  # close code: a page from another site
 _LATER: Final = 1013  # close code: too many connections at present
 
@@ -36,7 +36,7 @@ _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
 _ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")
-_OWN_SITE: Final = {"same-origin", "none"}  # none: the address was typed or a bookmark opened
+_OWN_SITE: Final = {"same-origin", "none"}  # none: the user typed the address or opened a bookmark
 _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
@@ -59,10 +59,10 @@ def bind_address(host: str) -> tuple[str, bool]:
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """The values of ``Host`` that browsers send when they really mean this server.
+    """The values of ``Host`` that browsers send when they genuinely want this server.
 
-    ``any_address``: also accept any IP address with the right port, because the server listens on all of the machine's
-    addresses. Unlike a name, an address can't be redirected.
+    ``any_address``: also accept any IP address with the right port, because the server listens on all addresses of the
+    machine. Unlike a name, an address can't be redirected.
     """
 
     exact: frozenset[str]
@@ -85,7 +85,7 @@ class Names:
 
 
 def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
-    """Return the names by which a server can be reached. ``more``: further host names by which browsers reach it."""
+    """Return the names by which a server can be reached. ``more``: other host names that browsers use to reach it."""
     known = ipaddress.ip_address(address)
     bare = {name.lower() for name in more}
     if known.is_loopback:
@@ -97,7 +97,7 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
 
 
 def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names, path: str = "") -> str:
-    """Return why a request can't come from this page; empty if it can."""
+    """Return why a request can't have come from this page; empty if it can."""
     given: dict[str, list[str]] = {"host": [], "origin": [], "sec-fetch-site": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
@@ -115,7 +115,7 @@ def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], name
 
 
 def needed(kind: str, method: str, path: str) -> Role | None:
-    """Return the role that a request needs; None if anyone may send it."""
+    """Return the role that a request requires, or None if anyone may send it."""
     if kind == "websocket":
         return Role.PILOT if _CONTROL.fullmatch(path) else Role.OBSERVER
     if _PUBLIC.fullmatch(path):
@@ -124,10 +124,10 @@ def needed(kind: str, method: str, path: str) -> Role | None:
 
 
 class Guard:
-    """ASGI middleware that decides which requests are answered, and adds protective headers to every answer.
+    """ASGI middleware that decides which requests are answered, and adds protective headers to every response.
 
-    :func:`foreign` and :func:`needed` determine which requests it refuses; it stores the sender of all others in
-    ``scope["person"]`` (None for a stranger).
+    :func:`foreign` and :func:`needed` determine which requests are refused. The sender of every other request is stored
+    in ``scope["person"]`` (None for a stranger).
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
@@ -167,7 +167,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # A request for another host name is refused, so its policy needs no host.
+        # A request for another host name is refused, so the policy of such a request needs no host.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (
@@ -177,7 +177,7 @@ class Guard:
 
 
 def person_of(scope: Scope) -> Person | None:
-    """Return who sent this request, as determined by the guard."""
+    """Return the sender of this request, as determined by the guard."""
     person: Person | None = scope["person"]
     return person
 
@@ -198,12 +198,12 @@ async def gone_within(receive: Receive, within_s: float) -> bool:
 
 
 async def _connected() -> Message:
-    """Return a WebSocket's first message, which has already been received."""
+    """Return the first message of a WebSocket, which has already been received."""
     return {"type": "websocket.connect"}
 
 
 def _everybody(_: Person | None) -> str:
-    """Admit everyone; used if connections are not counted."""
+    """Admit everyone; used if connections are not limited."""
     return ""
 
 
@@ -214,7 +214,7 @@ async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: in
         await send({"type": "http.response.body", "body": reason.encode()})
         return
     await receive()
-    if code != _FOREIGN:  # accept first: browsers only report the reason for a socket that was open
+    if code != _FOREIGN:  # accept first, because browsers report the reason only for a socket that was open
         await send({"type": "websocket.accept"})
     await send({"type": "websocket.close", "code": code, "reason": reason})
 

@@ -1,4 +1,4 @@
-"""Run the cockpit: bind its address, find drones and serve the page until stopped."""
+"""Run the cockpit: bind its address, find drones, and serve the page until it is stopped."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
 
 RECORDINGS = Path("recordings")  #: the default folder for recordings
 _LARGEST_MESSAGE = 4096  # maximum size of a message from a page [bytes]
-_LOOK_S = 0.05  # interval between checks of ``stop``
+_LOOK_S = 0.05  # interval between checks whether ``stop`` is set
 _PING_S = 10.0  # a connection that does not answer for this long is closed
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may connect, and from where. By default: this user, on this machine, as a pilot.
+    """Who may connect, and from where. By default, only this user can connect, on this machine, as a pilot.
 
-    ``host``: the address to listen on; any other than loopback needs ``token_file``, ``client_ca`` or ``pair``.
-    ``token_file``: lines of the form ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
-    certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the clients' certificates; their
-    OU is the role. ``role``: everyone's role, unless tokens or certificates decide it. ``hostnames``: names by which
-    browsers reach this machine if they don't use its address. ``pair``: admit, as ``role``, the first browser that
-    opens the address in the QR code shown; each code works once. ``page_authority``: PEM file of the authority that
-    signed ``tls_cert``, offered for browsers to trust.
+    ``host``: the address to listen on; any address other than loopback requires ``token_file``, ``client_ca`` or
+    ``pair``. ``token_file``: lines of the form ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the
+    server's certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the clients'
+    certificates; a certificate's OU is the role. ``role``: the role of every user, unless tokens or certificates
+    determine it. ``hostnames``: names that browsers use to reach this machine if they don't use its address. ``pair``:
+    admit the first browser that opens the address in the QR code, with role ``role``; each code works once.
+    ``page_authority``: PEM file of the authority that signed ``tls_cert``, offered for browsers to trust.
 
     Raises:
         UsageError: The options are contradictory.
@@ -102,17 +102,17 @@ def serve_cockpit(
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) arrives.
 
     Args:
-        names: The drones to show; if empty, every drone discovered, including any that appear later.
-        port: The TCP port; 0 selects a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
-            free one).
-        access: Who may connect, and from where; by default this user, on this machine, as a pilot.
-        recordings: The folder for recordings, created when needed.
-        on_ready: Called once on this thread with the page's address. By default the address is printed, with a QR code
-            if others can reach the page and standard output is a terminal.
+        names: The drones to show; if empty, show every drone discovered, including any that appear later.
+        port: The TCP port; 0 selects a free port (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
+        free one).
+        access: Who may connect, and from where; by default only this user, on this machine, as a pilot.
+        recordings: The folder for recordings, which is created when needed.
+        on_ready: Called once on this thread with the page's address. By default, the address is printed, with a QR code
+            if other machines can reach the page and standard output is a terminal.
         stop: Stops the server when set from any thread.
         network: Also show drones reachable over this network.
-        world: File or name of a shipped world, used as the surroundings of drones that don't report any.
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None for no endpoint.
+        world: File or name of a shipped world, used as the surroundings of drones that report none.
+        metrics: ``[HOST:]PORT`` of a Prometheus endpoint, whose address is printed; None for no endpoint.
 
     Raises:
         UsageError: An address, port or file is invalid.
@@ -178,10 +178,10 @@ def serve_cockpit(
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
-    """Return the same access over https, with a certificate for this machine, which is created or renewed if necessary.
+    """Return the same access over https, with a certificate for this machine that is created or renewed if necessary.
 
     Args:
-        access: Access without a certificate.
+        access: Access settings that have no certificate yet.
         directory: Contains certificates and their authority (:mod:`skyloop.network.keys.lab`).
 
     Raises:
@@ -237,7 +237,7 @@ def _gate(access: Access, port: int) -> Gate:
         return CertificateGate()
     if access.token_file is not None or access.pair:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
-        cookie = f"skyloop-cockpit-{port}"  # browsers share cookies between ports
+        cookie = f"skyloop-cockpit-{port}"  # browsers share cookies between all ports of a host
         pairing = Pairing(access.role) if access.pair else None
         return TokenGate(tokens, cookie, pairing=pairing, kept=_session_file(cookie))
     if sys.platform != "linux":
@@ -256,7 +256,7 @@ def _session_file(cookie: str) -> SessionFile | None:
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()
-    with suppress(LinkError, OSError):  # without it, sessions end with this process, and a warning is logged
+    with suppress(LinkError, OSError):  # without this file, sessions end with the process, and a warning is logged
         folder.create()
     return SessionFile(folder.path / f"{cookie}.sessions")
 
@@ -291,8 +291,8 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
     class Protocol(H11Protocol):
         """uvicorn's protocol, which also informs the application and the admission.
 
-        The application gets the client's certificate, which uvicorn does not pass on; the admission is informed about
-        the progress of the connection.
+        The application receives the client's certificate, which uvicorn does not pass on; the admission is informed of
+        the connection's progress.
         """
 
         def __init__(self, connection: Connection) -> None:
@@ -301,7 +301,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self.client = self.client or (self._connection.address, 0)  # the client may already have disconnected
+            self.client = self.client or (self._connection.address, 0)  # the client may have disconnected already
             self._connection.end = transport.abort
             tls = transport.get_extra_info("ssl_object")
             self.app_state = {
@@ -341,7 +341,7 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
         ws_ping_timeout=_PING_S,
         ws_per_message_deflate=False,  # pictures are already compressed
         lifespan="on",
-        # Data left in the buffers of a stalled page must not delay shutdown.
+        # Data that is still buffered for a stalled page must not delay shutdown.
         timeout_graceful_shutdown=2,
     )
     return QuietServer(config)
@@ -362,7 +362,7 @@ async def _run(
     while not server.started and not serving.done():
         await asyncio.sleep(_LOOK_S / 10)
     listening = asyncio.create_task(listener.run())
-    await asyncio.sleep(0)  # the first step starts listening
+    await asyncio.sleep(0)  # the first step of the event loop starts listening
     if not serving.done():
         on_ready()
     while not serving.done():
@@ -374,7 +374,7 @@ async def _run(
     await asyncio.gather(listening, return_exceptions=True)
     await serving
     if not listening.cancelled():
-        await listening  # raises the error that ended it
+        await listening  # raises the error that ended the listener
 
 
 def fleet_sources(fleet: Fleet) -> list[Source]:

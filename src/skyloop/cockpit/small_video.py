@@ -1,6 +1,6 @@
-"""Send small video streams from many drones to a page over one socket, at a steady rate, in joint messages.
+"""Send small video streams from many drones to a page over one socket, at a steady rate, several pictures per message.
 
-Otherwise, a page that shows twelve drones would need twelve sockets, and would wake up and repaint for every frame.
+Otherwise, a page that shows twelve drones would need twelve sockets, and would wake and repaint for every frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.stream import PageCounts
 
 SEND_HZ: Final = 60.0  #: maximum number of messages per second
-GATHER_S: Final = 0.005  #: time for which a picture waits for other cameras' pictures, which often arrive together
+GATHER_S: Final = 0.005  #: time for which a picture waits for pictures of other cameras, which often arrive together
 MAX_SHOWN: Final = 64  #: maximum number of cameras shown on one page at a time
 _BAD_MESSAGE: Final = 1008
 
@@ -41,8 +41,8 @@ class _Place(msgspec.Struct, frozen=True):
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
     """A message from a page.
 
-    The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes that) or stops; it can't decode a
-    camera's pictures until the next key frame (``key``); or it acknowledges what it has drawn.
+    The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes H.264) or stops showing it; it can't
+    decode a camera's pictures until the next key frame (``key``); or it acknowledges what it has drawn.
     """
 
     show: _Place | None = None
@@ -65,7 +65,7 @@ class _Shown:
     sent: int = 0  #: serial number of the last JPEG sent
 
     def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
-        """Subscribe to the camera; also called after the drone was reconnected or replaced.
+        """Subscribe to the camera; also called after the drone has been reconnected or replaced.
 
         JPEGs are subscribed to only while nothing else is shown.
         """
@@ -102,10 +102,10 @@ class _Shown:
 
 
 class SmallVideoSender:
-    """Sends one page the newest frame of each camera it shows, in one message, until the page disconnects.
+    """Sends one page the newest frame of each camera that it shows, in one message, until the page disconnects.
 
-    The next message is sent once the page has drawn the previous one, so a slow page gets fewer frames, but never older
-    ones, and does not delay other pages.
+    The next message is sent once the page has drawn the previous one. A slow page therefore receives fewer frames, but
+    never older ones, and does not delay other pages.
     """
 
     def __init__(self, socket: WebSocket, stations: Mapping[str, Station], counts: PageCounts) -> None:
@@ -125,7 +125,7 @@ class SmallVideoSender:
         due_s = time.monotonic()
         try:
             while not receiver.done():
-                with suppress(TimeoutError):  # JPEGs don't wake this task
+                with suppress(TimeoutError):  # JPEGs do not wake this task
                     await asyncio.wait_for(self._wake.wait(), 1.0 / SEND_HZ)
                 self._wake.clear()
                 await asyncio.sleep(max(due_s - time.monotonic(), GATHER_S))
@@ -159,7 +159,7 @@ class SmallVideoSender:
         self._counts.frames_sent += len(heads)
 
     def _pictures(self, shown: _Shown) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """Yield a camera's unsent pictures and their data; there may be several only for H.264."""
+        """Yield a camera's pictures that have not been sent, with their data; only for H.264 may there be several."""
         stream, feed, station = shown.stream, shown.feed, shown.station
         if station is None:
             return
@@ -190,7 +190,7 @@ class SmallVideoSender:
             self._problem = self._handle(message.get("text") or "")
 
     def _handle(self, text: str) -> str:
-        """Handle a message; return its problem, or an empty string if it is valid."""
+        """Handle a message; return the problem with it, or an empty string if it is valid."""
         try:
             message = msgspec.json.decode(text, type=_Message)
         except msgspec.DecodeError as error:

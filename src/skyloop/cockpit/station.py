@@ -1,4 +1,4 @@
-"""One drone in the cockpit: the state that its pages share, and each page's own connection for flying it."""
+"""One drone in the cockpit: the state that its pages share, and the connection that each page uses to fly it."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
-FRESH_S: Final = 0.2  #: time limit for fresh feedback to arrive
+FRESH_S: Final = 0.2  #: time to wait for fresh feedback
 PILOT_S: Final = 2.0  #: time limit for opening a pilot's connection
 RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recorded drones
-SHOWN_S: Final = 8.0  #: time for which a stop is repeated until the vehicle reports stopped motors
-STOPPER: Final = "cockpit stop"  #: name of the application that sends emergency stops, and nothing else
+SHOWN_S: Final = 8.0  #: time for which a stop is repeated until the vehicle reports that its motors have stopped
+STOPPER: Final = "cockpit stop"  #: name of the application that sends emergency stops and nothing else
 RETRY_S: Final = 0.05  #: pause between attempts to send an emergency stop
 _log = logging.getLogger(__name__)
 
 
 class PilotConnection(Drone):
-    """A pilot's connection that requests the authority in :meth:`acquire` rather than when it is opened.
+    """A pilot's connection that requests authority in :meth:`acquire` rather than when it is opened.
 
-    Without the authority, all it can do is stop the motors in an emergency.
+    Without authority, it can only stop the motors in an emergency.
     """
 
-    _newest: tuple[AnyAction, int] = Idle(), 0  # the last :meth:`command` and its number
+    _newest: tuple[AnyAction, int] = Idle(), 0  # the last :meth:`command` and its sequence number
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
-        """Connect without requesting the authority. ``dial``: opens a new connection to the proxy on each call."""
+        """Connect without requesting authority. ``dial``: opens a new connection to the proxy on each call."""
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
@@ -56,7 +56,7 @@ class PilotConnection(Drone):
         commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
-        """Treat the page as present until this time on the process's monotonic clock, and as silent afterwards."""
+        """Consider the page present until this time (on the process's monotonic clock), and silent afterwards."""
         commands(self).present_until(until_ns)
 
     @property
@@ -70,17 +70,17 @@ class PilotConnection(Drone):
         return self.link.application in (LinkState.UP, LinkState.DEGRADED)
 
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
-        """Request the authority now.
+        """Request authority now.
 
-        ``priority``: 0 is the highest, 31 the lowest. ``ask``: ask the holder first, and wait in the queue instead of
-        failing. Raise ``AuthorityError`` if another application holds the authority; the message names it.
+        ``priority``: 0 (highest) to 31 (lowest). ``ask``: ask the current holder first, and wait in the queue instead
+        of failing. Raise ``AuthorityError`` if another application holds the authority; the message names it.
         """
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer a request for the authority and wait until the proxy has received the answer.
+        """Answer a request for authority and wait until the proxy has received the answer.
 
-        Raise ``RefusedError`` if this connection no longer holds the authority.
+        Raise ``RefusedError`` if this connection no longer holds authority.
         """
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
@@ -96,7 +96,7 @@ class PilotConnection(Drone):
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
-        """Whether a failsafe, a lost link or a lost lease ended this action, which could now be sent again."""
+        """Whether a failsafe, a lost link or a lost lease has ended this action; if so, it could now be sent again."""
         newest, intent = self._newest
         outcome = commands(self).outcome(intent) if newest is action else None
         return outcome is not None and outcome.fate in OVERRULED and commands(self).may_ask
@@ -115,7 +115,7 @@ class PilotConnection(Drone):
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether the proxy reports what became of the newest command, which proves that it arrived."""
+        """Whether the proxy reports the outcome of the newest command, which proves that the command arrived."""
         newest, (_, intent) = Known(self).newest, self._newest
         outcome = None if newest is None else newest.outcome
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
@@ -126,7 +126,7 @@ class PilotConnection(Drone):
 
     @property
     def is_flying(self) -> bool:
-        """Whether the vehicle is flying rather than hovering, according to the newest feedback."""
+        """Whether the vehicle's state is flying rather than hovering, according to the newest feedback."""
         try:
             return self.feedback().state is FlightState.FLYING
         except LinkError:
@@ -140,7 +140,7 @@ class FlyingSession(Protocol):
 
     @property
     def waits(self) -> bool:
-        """Whether the page waits for the authority."""
+        """Whether the page is waiting for authority."""
 
     def stand_down(self, why: str) -> None:
         """Send no more commands."""
@@ -150,7 +150,7 @@ class FlyingSession(Protocol):
 
 
 class Station:
-    """One drone and the state that its pages share. Created and closed on the event loop.
+    """One drone, and the state that its pages share. Created and closed on the event loop.
 
     ``drone``: the drone, connected as an observer; closed by :meth:`close`.
     """
@@ -161,17 +161,17 @@ class Station:
         self.event_feed = EventFeed(drone)
         self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
-        self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
+        self.small: dict[tuple[str, int], SmallFeed] = {}  #: keyed by camera and width [pixels]
         self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: H.264 streams by camera and encoding
-        self.goals: dict[str, Waypoint] = {}  #: where pages fly the drone to, by application name
+        self.goals: dict[str, Waypoint] = {}  #: goals to which pages are flying the drone, by application name
         self.routes = CheckedRoutes()
-        self.sessions: set[FlyingSession] = set()  #: sessions of pages that may fly it
+        self.sessions: set[FlyingSession] = set()  #: sessions of pages that may fly the drone
         self.pilots: set[PilotConnection] = set()  #: connections over which pages fly the drone
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
         drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # registered until the drone is closed
-        self._whole: Listener[Any] | None = None  # consumes all feedback while a page shows the drone
+        self._whole: Listener[Any] | None = None  # consumes all feedback while any page shows the drone
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
         self._stops = 0  # number of emergency stops in progress
@@ -180,7 +180,7 @@ class Station:
 
     @property
     def flies(self) -> bool:
-        """Whether there is a vehicle to fly; a recording accepts every command, but without effect."""
+        """Whether there is a vehicle to fly. A recording accepts every command, but the command has no effect."""
         return bool(self.drone.capabilities.actions) and not self.drone.uri.startswith(RECORDINGS)
 
     @property
@@ -211,13 +211,13 @@ class Station:
         return self.small.get((name, width))
 
     def encoded(self, name: str, form: Form) -> EncodedFeed:
-        """Return the feed of a camera's H.264 in one encoding; call :meth:`forget` once no page shows it."""
+        """Return the feed of a camera's H.264 in one encoding; call :meth:`forget` once no page shows the feed."""
         if (name, form) not in self.streams:
             self.streams[name, form] = EncodedFeed(self.drone, name, form)
         return self.streams[name, form]
 
     def forget(self, feed: EncodedFeed) -> None:
-        """Forget a feed that no page shows any more."""
+        """Discard a feed that no page shows anymore."""
         self.streams.pop((feed.camera, feed.form), None)
 
     def own_name(self) -> str:
@@ -228,18 +228,18 @@ class Station:
         return self._names.pop()
 
     def free_name(self, name: str) -> None:
-        """Release a name from :meth:`own_name`."""
+        """Release a name obtained from :meth:`own_name`."""
         self._names.append(name)
 
     def feedback(self) -> Feedback:
-        """Return the newest feedback, which arrives at a low rate while pages show only the drone's row.
+        """Return the newest feedback. Feedback arrives at a low rate while pages show only the drone's row.
 
-        Raise ``LinkError`` if there is no feedback, or the drone was closed.
+        Raise ``LinkError`` if there is no feedback or the drone has been closed.
         """
         return self.drone.feedback(max_hz=ROW_HZ)
 
     def fresh_feedback(self) -> Feedback:
-        """Wait for a state captured from now on, because the newest feedback may predate a take-off.
+        """Wait for a state that is captured from now on, because the newest feedback may predate a take-off.
 
         Raise ``LinkError`` if no feedback arrives within :data:`FRESH_S`.
         """
@@ -263,7 +263,7 @@ class Station:
     # Pilots ----------------------------------------------------------------------------------------------------
 
     async def open_pilot(self, app: str) -> PilotConnection:
-        """Open a pilot's connection that does not hold the authority yet.
+        """Open a connection for a pilot, without requesting authority yet.
 
         Raise ``SkyloopError`` if the connection can't be opened within :data:`PILOT_S`.
         """
@@ -276,40 +276,40 @@ class Station:
         return pilot
 
     async def close_pilot(self, pilot: PilotConnection) -> None:
-        """Close a pilot's connection, which releases what it holds."""
+        """Close a pilot's connection, which releases the authority it holds."""
         await asyncio.to_thread(pilot.close)
         self.pilots.discard(pilot)
 
     def pilot_came(self) -> None:
-        """Open the connection for emergency stops if needed, because a page that may send one has connected."""
+        """Open the connection for emergency stops if necessary, because a page that may send a stop has connected."""
         self._may_stop += 1
         if self._stopper is None:
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
             self._stopper.add_done_callback(_ignore_error)
 
     async def pilot_went(self) -> None:
-        """Close the connection for emergency stops once no page is left that may use it."""
+        """Close the connection for emergency stops once there are no pages left that may use it."""
         self._may_stop -= 1
         if not self._may_stop and self._stopper is not None:
             stopper, self._stopper = self._stopper, None
             await self._end(stopper)
 
     async def stopper(self) -> PilotConnection:
-        """Return the pilot's connection for emergency stops, which never holds the authority."""
+        """Return the pilot's connection for emergency stops, which never holds authority."""
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
         return await asyncio.shield(self._stopper)
 
     async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
-        """Stop the motors over a dedicated connection; until that is done, no page may fly the vehicle.
+        """Stop the motors over a dedicated connection; until this is done, no page may fly the vehicle.
 
         Args:
             until_ns: Latest time to send the stop for the first time, on this process's monotonic clock.
-            sent: Called when the stop was sent.
+            sent: Called once the stop has been sent.
 
         Raises:
-            LinkError: The stop was not sent, and never will be.
-            NoAnswerError: The vehicle does not report stopped motors within :data:`SHOWN_S`.
+            LinkError: The stop was not sent and never will be sent.
+            NoAnswerError: The vehicle does not report that its motors have stopped within :data:`SHOWN_S`.
             UnsupportedError: The vehicle has no emergency stop.
         """
         self._stops += 1
@@ -323,14 +323,14 @@ class Station:
             sent()
             await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
         except SkyloopError:
-            for session in self.sessions:  # their flights must not be resumed
+            for session in self.sessions:  # flights of these sessions must not be resumed
                 session.let_go("the vehicle does not show the emergency stop")
             raise
         finally:
             self._stops -= 1
 
     def check_stop(self) -> None:
-        """Raise :class:`RefusedError` while the vehicle has not yet reported the result of an emergency stop."""
+        """Raise :class:`RefusedError` as long as the vehicle has not reported the result of an emergency stop."""
         if self._stops:
             raise RefusedError("an emergency stop is under way: other commands wait until the vehicle shows it")
 
@@ -345,7 +345,7 @@ class Station:
                     return stopper
                 why = f"the link to the proxy is {stopper.link.application}"
                 with suppress(SkyloopError):
-                    stopper.idle()  # this loop retries; otherwise it would be sent whenever the link is restored
+                    stopper.idle()  # this loop retries; otherwise the stop would be sent whenever the link is restored
             except LinkError as error:
                 why = str(error)
             except TimeoutError:
@@ -381,7 +381,7 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
         stopper.wait(shows, SHOWN_S)
     except NoAnswerError:
         why = f"the vehicle has not shown stopped motors for {SHOWN_S:g} s: stop them again, or land it"
-        since_ns = from_ns - nanoseconds(PILOT_S)  # it may have been refused before this wait began
+        since_ns = from_ns - nanoseconds(PILOT_S)  # the command may have been refused before this wait began
         refused = (
             event.text
             for event in reversed(stopper.recent_events())
@@ -391,10 +391,10 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
 
 
 def _nothing(_: Feedback) -> None:
-    """Ignore feedback; a callback is needed for it to arrive at all, and pages show the newest."""
+    """Ignore feedback. A callback is needed for feedback to arrive at all; pages show the newest sample."""
 
 
 def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:
-    """Ignore the error: the next emergency stop tries again and raises it."""
+    """Ignore the error: the next emergency stop tries again and raises the error."""
     if not task.cancelled():
         task.exception()

@@ -1,7 +1,7 @@
-"""Send data to pages, with one object per open socket. A page that does not keep up gets less data, never older data.
+"""Send data to pages, with one object per open socket. A page that can't keep up gets less data, but never older data.
 
-Video: only one JPEG is in flight at a time; the page gets the newest one after it has drawn and acknowledged the last.
-Several H.264 pictures may be in flight, because they depend on one another; after a gap, a page needs a key frame.
+Video: only one JPEG is in flight at a time; the page gets the newest after it has drawn and acknowledged the previous.
+Several H.264 pictures may be in flight, because they depend on each other; after a gap, a page needs a key frame.
 Telemetry: the newest state about 20 times a second, or as fast as the socket accepts it, created once for all pages.
 """
 
@@ -31,28 +31,28 @@ if TYPE_CHECKING:
 
 # One camera as H.264 on one page: the choice of its stream, and its pictures -----------------------------------------
 #
-# Pages that keep up share a stream. A page whose acknowledgements arrive late gets its own stream, with a rate and size
-# adapted to the path to that page, until nothing has been late for a while.
+# Pages that keep up share a stream. A page whose acknowledgements arrive late gets its own stream, whose rate and size
+# are adapted to the path to that page, until nothing has been late for a while.
 
 
-LATE_S: Final = 0.25  #: a picture acknowledged after more than this is late
-FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all pictures were late for this long
-QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stream again; doubled after a relapse
+LATE_S: Final = 0.25  #: a picture counts as late if it is acknowledged after more than this time
+FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all of its pictures were late for this long
+QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stream again; doubled after each relapse
 MOST_QUIET_S: Final = 160.0
 SILENT_S: Final = 3.0  #: give up on a stream after this long without a picture
-RETRY_S: Final = 10.0  #: first pause before trying the stream again, doubled each time
+RETRY_S: Final = 10.0  #: first pause before the stream is tried again; doubled each time
 MOST_RETRY_S: Final = 300.0  #: longest pause; a proxy that refuses the stream reports each attempt
-MOST_UNDER_WAY: Final = 8  #: maximum number of pictures sent and not yet acknowledged
-MOST_BYTES: Final = 1_000_000  #: maximum total size of these pictures [bytes]; a single one may be larger
+MOST_UNDER_WAY: Final = 8  #: maximum number of pictures that are sent but not acknowledged yet
+MOST_BYTES: Final = 1_000_000  #: maximum total size of these pictures [bytes]; a single picture may be larger
 
 
 class PagePath:
-    """Decides from a page's acknowledgements whether it keeps up. Pure; takes the time as an argument."""
+    """Decides from a page's acknowledgements whether the page keeps up. Pure; takes the time as an argument."""
 
     def __init__(self) -> None:
-        self.behind = False  #: whether it needs a lower rate than other pages get
+        self.behind = False  #: whether the page needs a lower rate than other pages get
         self.late_here = False  #: whether pictures were already late when they reached the cockpit
-        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time sent
+        self._under_way: deque[tuple[int, int, int]] = deque()  # number, size in bytes and sending time
         self._trip_s = 0.0  # round-trip time of the newest acknowledged picture
         self._changed_ns: int | None = None  # time of the last change of ``_was_late``
         self._was_late = False
@@ -61,7 +61,7 @@ class PagePath:
 
     @property
     def free(self) -> bool:
-        """Whether another picture may be sent."""
+        """Whether another picture may be sent now."""
         waiting = self._under_way
         return len(waiting) < MOST_UNDER_WAY and (not waiting or sum(size for _, size, _ in waiting) < MOST_BYTES)
 
@@ -75,7 +75,7 @@ class PagePath:
         self._under_way.append((number, size, now_ns))
 
     def acknowledged(self, number: int, now_ns: int) -> int:
-        """Record that the page has a picture and all earlier ones; return how many of them were new."""
+        """Record that the page has received a picture and all earlier ones; return how many of these are new."""
         count = 0
         while self._under_way and self._under_way[0][0] <= number:
             self._trip_s = seconds(now_ns - self._under_way.popleft()[2])
@@ -83,9 +83,9 @@ class PagePath:
         return count
 
     def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
-        """Update the judgement; return whether the page is behind.
+        """Update the assessment; return whether the page is behind.
 
-        ``extra_s``: time that pictures take to reach the cockpit [s].
+        ``extra_s``: time it takes pictures to reach the cockpit [s].
         """
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
@@ -110,14 +110,14 @@ class Sent:
     picture: EncodedFrame
     form: Form
     age_s: float
-    late_here: bool = False  #: whether the page has its own stream because pictures reach the cockpit late
+    late_here: bool = False  #: whether the page has its own stream because the pictures already reach the cockpit late
 
 
 class PageStream:
     """One camera's H.264 stream to one page.
 
-    ``width``: width of the pane [device pixels], 0 for full size. ``max_fps``: maximum frame rate, None for no limit.
-    ``wake``: called on the event loop for each picture; None if the page polls.
+    ``width``: width of the pane [device pixels], or 0 for full size. ``max_fps``: maximum frame rate, or None for no
+    limit. ``wake``: called on the event loop for each picture, or None if the page polls.
     """
 
     def __init__(
@@ -139,18 +139,18 @@ class PageStream:
         self._clock = clock
         self._name = ""  # name of the page's own stream, if it has one
         self._feed: EncodedFeed | None = None
-        self._next: EncodedFeed | None = None  # will replace the current stream at its first key frame
+        self._next: EncodedFeed | None = None  # the stream that will replace the current one at its first key frame
         self._serial = 0  # number of the last picture sent
         self._follows = True  # whether the page can decode the next picture
-        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, feeds and numbers of pictures
-        self._late_s = 0.0  # delay of the newest picture when it reached the cockpit
+        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message number, feed and picture number
+        self._late_s = 0.0  # delay of the newest picture on its arrival in the cockpit
         self._missed = 0  # number of pictures skipped before those that are ready
         self._refused_ns: int | None = None
         self._retry_s = RETRY_S
 
     @property
     def shows(self) -> bool:
-        """Whether the page gets this stream; until then, it needs JPEGs."""
+        """Whether the page receives this stream; until it does, it needs JPEGs."""
         return self._feed is not None
 
     def resize(self, width: int) -> None:
@@ -186,7 +186,7 @@ class PageStream:
             self.path.sent(number, len(one.picture.data), self._clock())
 
     def acknowledged(self, number: int) -> int:
-        """Handle the page's report that it has drawn or skipped pictures; return how many were new."""
+        """Handle the page's report that it has drawn or skipped pictures; return how many were newly reported."""
         newest = None
         while self._numbers and self._numbers[0][0] <= number:
             newest = self._numbers.popleft()
@@ -216,7 +216,7 @@ class PageStream:
         return pictures
 
     def _choose(self) -> None:
-        """Subscribe to the stream that suits the page now; the current one remains in use until a key frame arrives."""
+        """Subscribe to the stream that now suits the page; the current one remains in use until a key frame arrives."""
         form = form_for(self._camera, self._width, self._max_fps)
         if self.path.update(self._clock(), self._late_s):
             self._name = self._name or self._station.own_name()
@@ -232,7 +232,7 @@ class PageStream:
         self._release(self._next)
         self._next = None
         if self._feed is not None and self._feed.form == form:
-            return  # it returned to the current stream before the other one arrived
+            return  # the page returned to the current stream before the other one arrived
         feed = self._station.encoded(self._camera.name, form)
         with suppress(SkyloopError):  # the drone is being closed
             feed.subscribe(self, self._wake)
@@ -258,8 +258,8 @@ class PageStream:
 # Sockets ---------------------------------------------------------------------------------------------------------
 
 
-DRAWN_BYTES = 65_536  #: maximum size of drawings sent to a page with one frame: about the size of the frame itself
-MAX_WAITING: Final = 256  #: answers queued for a page that does not read; further ones are dropped
+DRAWN_BYTES = 65_536  #: maximum size of the drawings sent to a page with one frame: about the size of the frame itself
+MAX_WAITING: Final = 256  #: number of responses queued for a page that does not read; further responses are dropped
 MAX_COUNTED = 256  #: maximum number of sources of drawings listed in the counts
 
 _BAD_MESSAGE = 1008
@@ -269,17 +269,17 @@ UNKNOWN = 4404  #: close code: there is no such drone or camera
 
 @dataclass(slots=True)
 class PageCounts:
-    """Counts for all pages since the start."""
+    """Counts across all pages since startup."""
 
     pages: int = 0  #: number of pages currently open
     frames_sent: int = 0
     frames_acknowledged: int = 0
     frames_skipped: int = 0  #: not sent because the page was still drawing the previous one
-    sources: set[str] = field(default_factory=set)  #: sources of the drawings sent
+    sources: set[str] = field(default_factory=set)  #: sources of the drawings that were sent
 
 
 class VideoSender:
-    """Sends one camera to one page until it disconnects, as H.264 if the page can decode that, otherwise as JPEGs."""
+    """Sends a camera's video to one page until it disconnects: H.264 if the page can decode it, otherwise JPEGs."""
 
     def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
@@ -291,10 +291,10 @@ class VideoSender:
         self._stream: PageStream | None = None  # set if the page decodes H.264
         self._as_jpeg = False  # whether JPEGs are subscribed to
         self._number = 0  # number of the last message
-        self._sent = 0  # number of the last JPEG sent; keeping the frame would occupy the proxy's memory
+        self._sent = 0  # number of the last JPEG sent; a reference to the frame would occupy the proxy's memory
         self._sent_ns = 0  # capture time of the last picture sent
-        self._waiting = 0  # number of the JPEG not yet acknowledged
-        self._drawn: dict[str, int] = {}  # capture times of the last drawings sent, by source in order of sending
+        self._waiting = 0  # number of the JPEG that has not been acknowledged yet
+        self._drawn: dict[str, int] = {}  # capture times of the drawings sent last, by source in the order of sending
 
     async def run(self) -> None:
         """Send until the page disconnects."""
@@ -305,7 +305,7 @@ class VideoSender:
             while not receiver.done():
                 self._choose()
                 with suppress(TimeoutError):
-                    # Wake up regularly, to detect that no pictures arrive or that the page accepts none.
+                    # Wake up regularly, to detect that no pictures are arriving or that the page is not accepting any.
                     await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
                 self._wake.clear()
                 await self._send_pictures()
@@ -325,7 +325,7 @@ class VideoSender:
             await asyncio.gather(receiver, return_exceptions=True)
 
     def _choose(self) -> None:
-        """Subscribe to JPEGs while the page gets no other stream."""
+        """Subscribe to JPEGs as long as the page gets no other stream."""
         as_jpeg = self._stream is None or not self._stream.shows
         if as_jpeg != self._as_jpeg:
             self._as_jpeg = as_jpeg
@@ -404,10 +404,10 @@ class VideoSender:
         self._counts.frames_skipped += skipped
 
     async def _send_drawings(self) -> None:
-        """Send drawings for the last frame sent or earlier ones, so that there are never more drawings than frames.
+        """Send drawings for the last frame sent or for earlier ones, so that there are never more drawings than frames.
 
-        At most :data:`DRAWN_BYTES` are sent with each frame, in pieces, starting with the sources sent longest ago, so
-        that many sources delay neither this page's pictures nor other pages.
+        At most :data:`DRAWN_BYTES` are sent with each frame, in pieces. The sources sent longest ago come first, so
+        many sources delay neither this page's pictures nor other pages.
         """
         newest = self._event_feed.drawings.items()
         drawings = {source: one for (camera, source), one in newest if camera == self._feed.camera}
@@ -431,7 +431,7 @@ class VideoSender:
 
 
 class BroadcastSender:
-    """Sends the messages of a broadcast to one page until it disconnects."""
+    """Sends the messages of a broadcast to one page until the page disconnects."""
 
     def __init__(self, socket: WebSocket, broadcast: PeriodicBroadcast) -> None:
         self._socket = socket
@@ -442,7 +442,7 @@ class BroadcastSender:
         """Send until the page disconnects."""
         gone = asyncio.create_task(self._until_gone())
         gone.add_done_callback(lambda _: self._wake.set())
-        wake = self._wake.set  # unsubscribing needs the same object
+        wake = self._wake.set  # unsubscribing requires the same object
         self._broadcast.subscribe(wake)
         try:
             while not gone.done() and not self._broadcast.closed:
@@ -470,7 +470,7 @@ class BroadcastSender:
 
 
 class TelemetrySender(BroadcastSender):
-    """Sends a drone's state and events, preceded by a description of the vehicle whenever that changes."""
+    """Sends a drone's state and events, preceded by a description of the vehicle whenever that description changes."""
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
         super().__init__(socket, station.broadcast)
@@ -491,19 +491,19 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page and passes on its commands. Used on the event loop."""
+    """Sends messages to one page and forwards the page's commands. Used on the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
         self._outbox: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Queue a message; drop it if the page has not read the last :data:`MAX_WAITING`."""
+        """Queue a message; drop it if the page has not read the last :data:`MAX_WAITING` messages."""
         with suppress(asyncio.QueueFull):
             self._outbox.put_nowait(message)
 
     async def serve(self, handle: Callable[[Sequence[str | bytes]], None]) -> None:
-        """Call ``handle`` with the messages received since the last call, oldest first, until the page disconnects.
+        """Call ``handle`` with the messages received since the previous call, oldest first, until the page disconnects.
 
         There may be several if this process was suspended; ``handle`` then sees the newest before acting on the oldest.
         """
@@ -530,13 +530,13 @@ class PageSocket:
             writing.cancel()
 
     async def _write(self) -> None:
-        with suppress(WebSocketDisconnect):  # the receiving side notices this as well
+        with suppress(WebSocketDisconnect):  # the receiving side notices this, too
             while True:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 
 
 class _FromPage(msgspec.Struct):
-    """A message from a page: drawn pictures, accepted kinds of pictures, or a picture it can't decode."""
+    """A message from a page: pictures drawn, picture kinds accepted, or a picture that it can't decode."""
 
     ack: int | None = None
     h264: bool | None = None
@@ -555,7 +555,7 @@ def _said(text: str) -> _FromPage | None:
 
 def picture_values(picture: Frame | SmallFrame | EncodedFrame, age_s: float, width: int, height: int) -> dict[str, Any]:
     """Return a picture's description for pages, as JSON values."""
-    captured = str(picture.captured_ns)  # too large for numbers in JavaScript
+    captured = str(picture.captured_ns)  # too large for a JavaScript number
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 
 

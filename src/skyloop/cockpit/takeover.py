@@ -1,6 +1,6 @@
-"""The authority as seen by a page: its holder, its loss, requests for it, and the page's place in the queue.
+"""The authority as a page sees it: its holder, its loss, requests for it, and the page's place in the queue.
 
-:class:`TakeoverQuestions` and :class:`QueueTracker` are pure, with the time as an argument; :class:`TakeoverDialog`
+:class:`TakeoverQuestions` and :class:`QueueTracker` are pure and take the time as an argument; :class:`TakeoverDialog`
 connects them to one page, and :class:`AuthorityReport` reports changes.
 """
 
@@ -27,11 +27,11 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuestion:
-    """A question from another application that wants the authority held by this page."""
+    """A question from another application that wants the authority this page holds."""
 
     query: TakeoverQuery
-    until_ns: int  #: when the question expires, on the proxy's clock
-    declined: bool = False  #: whether this page refused; a higher priority still gets the authority on expiry
+    until_ns: int  #: time at which the question expires, on the proxy's clock
+    declined: bool = False  #: whether this page refused; a higher priority still gets authority on expiry
 
     def to_json(self, now_ns: int) -> Json:
         """Return the question as JSON values; ``now_ns`` is on the proxy's clock."""
@@ -48,14 +48,14 @@ class TakeoverQuestion:
 class TakeoverQuestions:
     """A page's open questions, keyed by the number of the asking application. Times are on the proxy's clock.
 
-    Methods that may change them return whether anything changed.
+    Methods that may change the questions return whether anything changed.
     """
 
     def __init__(self) -> None:
         self._open: dict[int, TakeoverQuestion] = {}
 
     def find(self, by_id: int) -> TakeoverQuestion | None:
-        """Return an application's question, or None if it asks nothing."""
+        """Return an application's question, or None if the application asks nothing."""
         return self._open.get(by_id)
 
     def on_event(self, event: Event, app_id: int) -> bool:
@@ -78,25 +78,25 @@ class TakeoverQuestions:
         return True
 
     def update(self, lease: int, now_ns: int) -> bool:
-        """Drop expired questions and those about another lease."""
+        """Drop questions that have expired or concern another lease."""
         left = {by_id: one for by_id, one in self._open.items() if one.query.lease == lease and now_ns < one.until_ns}
         changed, self._open = len(left) != len(self._open), left
         return changed
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the message for the page; the application that gets the authority next comes first."""
+        """Return the message for the page; the application that would get authority next comes first."""
         ordered = sorted(self._open.values(), key=lambda one: (one.query.request.priority, one.until_ns))
         return {"type": "asked", "questions": [one.to_json(now_ns) for one in ordered]}
 
 
 @dataclass(frozen=True, slots=True)
 class QueuePosition:
-    """A page's position in the queue for the authority."""
+    """A page's position in the queue for authority."""
 
-    position: int | None  #: 1 if it is next; None if unknown
-    until_ns: int | None  #: when its turn is expected; None if unknown
-    asked: bool  #: whether the holder was asked first
-    declined: str | None  #: the holder's reason for keeping it, which may be empty; None if it did not decline
+    position: int | None  #: 1 if the page is next; None if unknown
+    until_ns: int | None  #: time at which its turn is expected; None if unknown
+    asked: bool  #: whether the person in control was asked first
+    declined: str | None  #: holder's reason for keeping control, which may be empty; None if it did not decline
 
     def to_json(self, now_ns: int) -> Json:
         """Return the position as JSON values; ``now_ns`` is on the monotonic clock."""
@@ -105,7 +105,7 @@ class QueuePosition:
 
 
 class QueueTracker:
-    """Tracks a page's position in the queue and the answer to its question."""
+    """Tracks a page's position in the queue and the response to its question."""
 
     def __init__(self) -> None:
         self._asked = False
@@ -114,7 +114,7 @@ class QueueTracker:
         self._until_ns: int | None = None
 
     def request(self, *, ask: bool) -> None:
-        """Start over, because the page requests the authority."""
+        """Start over, because the page has requested authority."""
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
@@ -125,9 +125,9 @@ class QueueTracker:
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
         """Return the page's position in the queue.
 
-        Return None if the page is not waiting. Otherwise, the value only changes when the status does.
+        Return None if the page is not waiting. Otherwise, the value changes only when the status changes.
         """
-        if status.state == "held":  # a pilot that was overruled later gets the authority back without asking
+        if status.state == "held":  # a pilot that was overruled regains authority later without asking
             self.request(ask=False)
         if status.state not in ("queued", "preempted"):
             return None
@@ -140,7 +140,7 @@ class QueueTracker:
 
 
 class TakeoverDialog:
-    """Handles both sides of a takeover for one page. Used on the event loop."""
+    """Handles both sides of a takeover on behalf of one page. Used on the event loop."""
 
     def __init__(self, send: Callable[[Json], None]) -> None:
         self._send = send
@@ -148,7 +148,7 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Start over, because the page requests the authority."""
+        """Start over, because the page has requested authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:
@@ -175,32 +175,32 @@ class TakeoverDialog:
             self._send(self._questions.to_json(pilot.proxy_now_ns))
 
 
-GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later loss is an ordinary one
+GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later loss of control is an ordinary loss
 
 
 class AuthorityReport:
-    """Compares the authority with the last message to the page. Used on the event loop.
+    """Compares the current authority with the last message sent to the page. Used on the event loop.
 
-    ``gone_s``: the page's control expires after this long without a sign of life from the cockpit [s].
+    ``gone_s``: the page's control expires after the cockpit has been silent for this long [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:
         self._station = station
         self._app = app
         self._gone_s = gone_s
-        #: Last values sent to the page: state, holder, its priority, position in the queue, how control was lost, and
-        #: the applications that wait.
+        #: Last values sent to the page: state, holder, the holder's priority, position in the queue, how control was
+        #: lost, and the waiting applications.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None, list[str]] | None = None
         self._was_mine = False
-        self._given, self._given_ns = False, 0  # whether and when it was handed over on request
-        self._loss: str | None = None  # how this page lost control; None if it did not
+        self._given, self._given_ns = False, 0  # whether control was handed over on request, and when
+        self._loss: str | None = None  # how this page lost control; None if it has not lost control
 
     def released(self) -> None:
-        """Treat the loss of control as intended, because the page released it."""
+        """Treat the loss of control as intended, because the page itself released control."""
         self._was_mine, self._loss = False, None
 
     def handed_over(self, *, given: bool = True) -> None:
-        """Treat the coming loss of control as a handover; ``given=False`` undoes that."""
+        """Treat the expected loss of control as a handover; ``given=False`` undoes this."""
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
@@ -210,7 +210,7 @@ class AuthorityReport:
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
-        next_owner: str | None = None  # the first in the queue, which may be a program
+        next_owner: str | None = None  # name of the first application in the queue, which may be a program
         try:
             feedback = self._station.feedback()
             holder, priority = self._station.view.holder(feedback), feedback.owner_priority
@@ -219,11 +219,11 @@ class AuthorityReport:
             holder, priority = None, None
         mine = state == "held"
         lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
-        if lost or (holder == self._app and not mine):  # the feedback is out of date
+        if lost or (holder == self._app and not mine):  # the feedback is outdated
             holder = None
         if holder is None:
             priority = None
-        if mine and pilot is not None:  # the lease is known here before feedback reports it
+        if mine and pilot is not None:  # our own lease is known here before feedback reports it
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
@@ -234,7 +234,7 @@ class AuthorityReport:
         sessions = self._station.sessions
         waiting = sorted(session.app for session in sessions if session.waits)
         if next_owner is not None and not lost and all(session.app != next_owner for session in sessions):
-            waiting.insert(0, next_owner)  # pages' own requests are known here before feedback reports them
+            waiting.insert(0, next_owner)  # requests from our own pages are known here before feedback reports them
         if (state, holder, priority, place, why, waiting) == self._sent:
             return None
         self._sent = state, holder, priority, place, why, waiting
@@ -253,7 +253,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is known to be higher than the holder's."""
+        """Return whether a priority is known to be higher than that of the holder."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:
@@ -261,7 +261,7 @@ class AuthorityReport:
         return held is None or priority < held
 
     def busy(self, priority: int) -> str:
-        """Return in words why a given priority can't take control."""
+        """Return text that explains why a given priority can't take control."""
         try:
             feedback = self._station.feedback()
         except LinkError:

@@ -1,8 +1,8 @@
-"""Keep frames while a person draws a box, and track its content from that frame on, on separate threads.
+"""Keep frames while a person draws a box, and track the box's content from that frame on; each uses its own thread.
 
-Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is only
-called on one other thread. It first catches up frame by frame, then always processes the newest frame. It computes a
-set-point after each frame, and at least every :data:`PERIOD_S`.
+Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is called
+on one other thread only. It first catches up frame by frame, and then always processes the newest frame. A set-point is
+computed after each frame, and at least every :data:`PERIOD_S`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from skyloop.messages.relayed import Shape
     from skyloop.vision import Detection
 
-KEPT_S: Final = 3.0  #: a box drawn on an older picture is refused and must be drawn again
+KEPT_S: Final = 3.0  #: a box drawn on a picture older than this is refused and must be drawn again
 KEPT_BYTES: Final = 64 * 1024 * 1024
 #: While catching up, a tracker uses the newest frame that is at most this much later than the previous one.
 STRIDE_S: Final = 0.07
@@ -39,15 +39,15 @@ STRIDE_S: Final = 0.07
 _KEPT_NS: Final = nanoseconds(KEPT_S)
 _STRIDE_NS: Final = nanoseconds(STRIDE_S)
 PERIOD_S: Final = 0.05  #: interval between set-points if there is no new frame
-SOURCE: Final = "follow"  #: source of the drawings
+SOURCE: Final = "follow"  #: source name of the drawings
 
 
 class KeptFrames:
-    """Frames as JPEGs, ordered by capture time: the newest :data:`KEPT_S` or :data:`KEPT_BYTES` of them."""
+    """Frames as JPEGs, ordered by capture time: only the newest :data:`KEPT_S` or :data:`KEPT_BYTES` are kept."""
 
     def __init__(self, most_bytes: int = KEPT_BYTES) -> None:
-        """Initialise without frames, to keep at most ``most_bytes`` of them."""
-        self.bytes = 0  #: size of all frames kept
+        """Initialise without frames; at most ``most_bytes`` of them are kept."""
+        self.bytes = 0  #: total size of the kept frames
         self._most_bytes = most_bytes
         self._frames: deque[Arrival] = deque()
 
@@ -91,10 +91,10 @@ class KeptFrames:
         )
 
     def next_after(self, captured_ns: int) -> Arrival | None:
-        """Return the next frame to track while catching up, or None if none is newer.
+        """Return the next frame to track while catching up, or None if no frame is newer.
 
-        This is the newest one within :data:`STRIDE_S` after the last or, if there is none, the first one after it.
-        ``captured_ns``: capture time of the last frame tracked.
+        This is the newest frame within :data:`STRIDE_S` after the last one or, if there is none, the first frame after
+        it. ``captured_ns``: capture time of the last tracked frame.
         """
         best = None
         for arrival in self._frames:
@@ -107,27 +107,27 @@ class KeptFrames:
         return best
 
 
-_DEPTH: Final = 8  # number of frames queued, so that the one shown on the page is not dropped
+_DEPTH: Final = 8  # number of queued frames; large enough that the frame shown on the page is not dropped
 _SAMPLES: Final = 1024  # number of feedback samples kept for the frames
 _RESULTS: Final = 16  # number of processor results kept
 
 
 class FrameKeeper:
-    """Keeps one camera's frames, with feedback and detections, until :meth:`close`.
+    """Keeps one camera's frames, together with feedback and detections, until :meth:`close` is called.
 
     ``drone``: provides the frames; may be connected as an observer. ``first``: called once with the capture time of the
-    first frame kept [ns], on the listener's thread.
+    first stored frame [ns], on the listener's thread.
     """
 
     def __init__(self, drone: Drone, camera: str, first: Callable[[int], None] = lambda _: None) -> None:
         self.camera = camera
-        self.keeps = True  #: whether to keep older frames, not only the newest
+        self.keeps = True  #: whether to keep older frames in addition to the newest
         self._first: Callable[[int], None] | None = first
         self._kept = KeptFrames()
         self._newest: Frame | None = None
         self._samples: deque[Feedback] = deque(maxlen=_SAMPLES)
         self._results: deque[Result] = deque(maxlen=_RESULTS)
-        self._news = threading.Condition()  # guards the fields above
+        self._news = threading.Condition()  # guards the fields above this one
         self._closed = False
         self._listeners: list[Listener[Any]] = [
             drone.on_feedback(self._on_feedback, inline=True),
@@ -141,20 +141,20 @@ class FrameKeeper:
             return self._kept.find(captured_ns)
 
     def catch_up(self, captured_ns: int) -> Arrival | None:
-        """Return the next frame to track while catching up, or None if none is newer."""
+        """Return the next frame to track while catching up, or None if there is no newer frame."""
         with self._news:
             return self._kept.next_after(captured_ns)
 
     def newest(self, captured_ns: int, timeout_s: float) -> Frame | None:
-        """Wait for a frame other than the one with this capture time; return the newest, or None on time-out."""
+        """Wait for a frame other than the one with this capture time; return the newest frame, or None on time-out."""
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # keep no reference: the frame's memory belongs to the proxy
+            frame, self._newest = self._newest, None  # keep no reference, as the frame's memory belongs to the proxy
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:
-        """Return and remove the feedback up to a capture time [ns], or all of it if that is None."""
+        """Return and remove the feedback up to a capture time [ns], or all feedback if the time is None."""
         taken = []
         with self._news:
             while self._samples and (until_ns is None or self._samples[0].captured_ns <= until_ns):
@@ -193,7 +193,7 @@ class FrameKeeper:
     def _on_frame(self, frame: Frame) -> None:
         kept = compressed(frame) if self.keeps else None
         with self._news:
-            if self._closed or not self._samples:  # the vehicle's state when the frame was captured is unknown
+            if self._closed or not self._samples:  # the vehicle's state at the time the frame was captured is unknown
                 return
             if kept is not None and self.keeps:
                 self._kept.add(kept)
@@ -205,14 +205,14 @@ class FrameKeeper:
 
 
 def warm_up() -> None:
-    """Track once in a noise image, so that imports, which hold the GIL, do not stall flights later.
+    """Run a tracker once on a noise image, so that imports, which hold the GIL, do not stall flights later.
 
-    SciPy, which matches detections, takes half a second to import on an idle computer and seconds on a busy one. This
-    therefore runs when the cockpit starts, on a thread other than the event loop's, rather than when the first target
-    is marked.
+    SciPy, which matches detections, takes half a second to import on an idle computer and several seconds on a busy
+    one. This function therefore runs when the cockpit starts, on a thread other than that of the event loop, rather
+    than when the first target is marked.
     """
     noise = np.random.default_rng(1).integers(0, 255, (96, 96, 3), np.uint8)
-    with suppress(MissingExtraError):  # will be reported when a target is marked
+    with suppress(MissingExtraError):  # the error will be reported when a target is marked
         tracker = LongTermTracker()
         tracker.start(noise, (32.0, 32.0, 24.0, 32.0))
         tracker.update(noise)
@@ -240,13 +240,13 @@ class TrackReport:
     """The result of one step."""
 
     status: FollowStatus | None  #: the follower's status; None before its first frame
-    caught_up: bool  #: whether it has tracked up to the newest frame
-    action: AnyAction | None  #: the current set-point; None while catching up or if none is needed
+    caught_up: bool  #: whether the tracker has processed the newest frame
+    action: AnyAction | None  #: current set-point; None while catching up or if no set-point is needed
     over: bool  #: whether the follower has given up
     size: tuple[int, int]  #: width and height of the frames [px]
-    frame_ns: int  #: time when the last frame was tracked, on this process's clock
+    frame_ns: int  #: time at which the last frame was tracked, on this process's clock
     frame_age_s: float  #: age of the last frame when it was tracked [s]
-    problem: str = ""  #: an error in the follower, which is not called again; empty if there is none
+    problem: str = ""  #: the follower's error, after which the follower is not called again; empty if there is none
 
 
 class TargetTracker:
@@ -266,8 +266,8 @@ class TargetTracker:
         clock: Clock = monotonic_ns,
     ) -> None:
         self.steers = False  #: whether to compute set-points
-        self.mode = ""  #: mode to apply with the next step; empty for no change
-        self.settings: Any = None  #: settings to apply with the next step; None for no change
+        self.mode = ""  #: mode to apply in the next step; empty for no change
+        self.settings: Any = None  #: settings to apply in the next step; None for no change
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
@@ -276,7 +276,7 @@ class TargetTracker:
         self._report = report
         self._clock = clock
         self._closed = False
-        self._seen_ns = 0  # capture time of the last frame tracked
+        self._seen_ns = 0  # capture time of the last tracked frame
         self._frame_ns = clock()
         self._frame_age_s = 0.0
         self._size = (begin.header.width, begin.header.height)
@@ -313,7 +313,7 @@ class TargetTracker:
             self._keeper.close()
 
     def _catch_up(self, follower: Follower) -> None:
-        """Track in the kept frames from the box's frame on, for at most :data:`KEPT_S`, then in the newest frames."""
+        """Track from the box's frame through the kept frames for at most :data:`KEPT_S`, then in the newest frames."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
         arrival: Arrival | None
         arrival, self._begin = self._begin, None
@@ -334,7 +334,7 @@ class TargetTracker:
                 follower.settings = settings
         self._feed(follower, None)
         for result in self._keeper.results():
-            with suppress(DecodeError, MissingExtraError):  # treat it as if no program had sent any detections
+            with suppress(DecodeError, MissingExtraError):  # proceed as if no program had sent any detections
                 if isinstance(value := result.value, dict) and "detections" in value:
                     follower.detected(detections_of(value), result.captured_ns)
         if frame is not None:
@@ -349,7 +349,7 @@ class TargetTracker:
 
     def _track(self, follower: Follower, frame: Frame) -> None:
         shapes = follower.look(frame)
-        if not self.steers:  # the drawing would include the control law's state
+        if not self.steers:  # the drawing would include the state of the control law
             shapes = [one for one in shapes if not isinstance(one, Text)]
         self._seen_ns = frame.captured_ns
         self._frame_ns = self._clock()

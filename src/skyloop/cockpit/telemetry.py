@@ -1,6 +1,6 @@
-"""The view model: a drone's data for pages, created once for all of them, as plain JSON values.
+"""The view model: a drone's data for pages, created once for all pages, as plain JSON values.
 
-All values are in SI units and radians; pages convert. Unknown values are null.
+All values are in SI units and radians; pages convert them. Unknown values are null.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 
 _TARGET = re.compile(r"truth\.target\d*\.\w+")
-MAX_TEXT = 1000  #: maximum length of an event's text; a new page may get hundreds of events
+MAX_TEXT = 1000  #: maximum length of an event's text; a new page may receive hundreds of events
 
-#: The page's names for the numbers in feedback.
+#: The names that the page uses for the numbers in feedback.
 _NUMBERS = {
     "battery": "battery",
     "battery_v": "battery_v",
@@ -53,7 +53,7 @@ _VECTORS = {
     "position": ("position_m", ("x", "y", "z")),
 }
 _BROKEN = (str(LinkState.LOST), str(LinkState.CLOSED))
-_CHANNELS_S = 0.5  # interval between updates: statistics require sorting, and people read no faster
+_CHANNELS_S = 0.5  # interval between updates; statistics require sorting, and people read no faster
 
 encode_json = msgspec.json.Encoder().encode
 
@@ -64,7 +64,7 @@ def number(value: float | None) -> float | None:
 
 
 def vector(values: tuple[float, ...] | None) -> list[float | None] | None:
-    """Convert a vector for JSON; return None if it is unknown."""
+    """Convert a vector for JSON, or return None if it is unknown."""
     return None if values is None else [number(value) for value in values]
 
 
@@ -72,7 +72,7 @@ def feedback_values(feedback: Feedback, now_ns: int) -> Json:
     """Convert feedback to JSON values; ``now_ns`` is on the proxy's clock."""
     return {
         "age_s": number(seconds(now_ns - feedback.captured_ns)),
-        "captured_ns": str(feedback.captured_ns),  # too large for numbers in JavaScript
+        "captured_ns": str(feedback.captured_ns),  # too large for a JavaScript number
         "state": str(feedback.state),
         **_scalars(feedback),
         "velocity": vector(feedback.velocity_m_s),
@@ -90,7 +90,7 @@ def _scalars(feedback: Feedback) -> dict[str, float | None]:
 
 
 def motion_values(feedback: Feedback | None) -> Json:
-    """Return the values for the instruments; unknown ones are null."""
+    """Return the values for the instruments; unknown values are null."""
     if feedback is None:
         names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "start", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
@@ -112,7 +112,7 @@ def motion_values(feedback: Feedback | None) -> Json:
 def flat_values(
     feedback: Feedback | None, logged: Mapping[str, float], set_point: AnyAction | None
 ) -> dict[str, float | None]:
-    """Return every number under a unique name, for use in plots.
+    """Return all numeric values under unique names, for use in plots.
 
     Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. Unknown numbers are omitted.
     """
@@ -132,7 +132,7 @@ def flat_values(
 
 
 def set_point_values(action: AnyAction, age_s: float) -> Json:
-    """Convert a command, as applied, to JSON values."""
+    """Convert a command, in the form that was applied, to JSON values."""
     return {
         "action": ACTION_NAMES[type(action)],
         "values": {name: number(value) for name, value in _fields(action)},
@@ -143,7 +143,7 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
     """Convert a motion capture pose to JSON values.
 
-    ``pose``: position [m] and quaternion x, y, z, w; None if unknown.
+    ``pose``: position [m] and quaternion x, y, z, w, or None if unknown.
     """
     if pose is None:
         return None
@@ -226,7 +226,7 @@ class TelemetryView:
         self._channels_task: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """Return the values that change only with the vehicle."""
+        """Return the values that change only if the vehicle changes."""
         station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",
@@ -242,7 +242,7 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """Return the newest of all changing values, as a JSON object that lacks its final brace."""
+        """Return the newest values of everything that changes, as a JSON object that lacks its final brace."""
         self._refresh_channels()
         return encode_json(self._values(self._clock()))[:-1]
 
@@ -270,29 +270,29 @@ class TelemetryView:
     def alarms(self, feedback: Feedback | None) -> list[Alarm]:
         """Return the current alarms, the most severe first."""
         drone = self._station.drone
-        # Feedback that is old only because it is sent less often is no reason for an alarm.
+        # Feedback that is old only because it is sent less often is no cause for an alarm.
         age_s = None if feedback is None else self._age_s(feedback.captured_ns) - self._station.feedback_period_s
-        ages: dict[str, float] = {}  # age of the newest stream shown, by camera
+        ages: dict[str, float] = {}  # age of the newest stream that is shown, by camera
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
                 ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
         link = drone.link
         degraded_s = self._degraded.update(link, self._clock())
         found = alarms(link, feedback, age_s, ages, degraded_s, self._station.thresholds.newest())
-        # A replay's proxy also has a failsafe, but no vehicle to land.
+        # A replay's proxy also has a failsafe, but there is no vehicle to land.
         return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 
     def holder(self, feedback: Feedback | None) -> str | None:
-        """Return the name of the authority's holder.
+        """Return the name of the application that holds authority.
 
-        None if no lease is in force, even if feedback still contains the name of its last holder, and while the proxy
-        can't be reached.
+        None if no lease is in force (even if feedback still contains the name of its last holder) or the proxy can't be
+        reached.
         """
         broken = self._links()["application"] in _BROKEN
         return None if feedback is None or broken or not feedback.lease else feedback.owner
 
     def is_mine(self, feedback: Feedback | None) -> bool:
-        """Return whether one of this cockpit's pages holds the authority."""
+        """Return whether one of this cockpit's pages holds authority."""
         return (
             feedback is not None
             and feedback.lease > 0
@@ -305,7 +305,7 @@ class TelemetryView:
         station, log_feed, feedback = self._station, self._station.log_feed, self._feedback()
         links = self._links()
         if links["application"] in _BROKEN:
-            log_feed.applied = None  # unknown while the link is down, and out of date afterwards
+            log_feed.applied = None  # unknown while the link is down, and outdated afterwards
         applied = log_feed.applied
         native = None if feedback is None else feedback.native
         proxy_ns = now_ns + station.drone.clock_offset_ns
@@ -333,7 +333,7 @@ class TelemetryView:
         try:
             return self._station.feedback()
         except LinkError:
-            return None  # there is none yet, or it was closed
+            return None  # there is no feedback yet, or the subscription was closed
 
     def _links(self) -> Json:
         link = self._station.drone.link
@@ -355,7 +355,7 @@ class TelemetryView:
         }
 
     def _waypoints(self) -> list[Json]:
-        """Return the goals of pages, followed by those that controllers have logged."""
+        """Return the goals set on pages, followed by the goals that controllers have logged."""
         goals = [
             {"position": vector(goal.position), "yaw": number(goal.yaw), "app": app}
             for app, goal in self._station.goals.items()
@@ -367,11 +367,11 @@ class TelemetryView:
         return goals + logged
 
     def _age_s(self, captured_ns: int) -> float:
-        """Return the age of a timestamp that is on the proxy's clock [s]."""
+        """Return the age of a timestamp on the proxy's clock [s]."""
         return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
 
     def _refresh_channels(self) -> None:
-        """Start reading the statistics again if they are old, without waiting for the result."""
+        """Start reading the statistics again if they are old; do not wait for the result."""
         now_ns = self._clock()
         old = self._channels_ns is None or seconds(now_ns - self._channels_ns) >= _CHANNELS_S
         if self._channels_task is None and old:
@@ -382,13 +382,13 @@ class TelemetryView:
         # Use a thread, because the drone asks the proxy for the command delay and waits for the answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
-            for feed in self._station.streams.values():  # H.264 shown on pages does not arrive as frames
+            for feed in self._station.streams.values():  # H.264 that pages show does not arrive as frames
                 name, youngest_s = f"video/{feed.camera}", feed.age_s
                 known = stats.get(name)
                 if youngest_s is not None and (known is None or known.age_s is None or youngest_s < known.age_s):
                     stats = {**stats, name: feed.stats()}
             shown = {feed.camera for feed in self._station.feeds if feed.wanted}
-            # There are no statistics for video that no page shows: it was not requested, so none arrived.
+            # Video that no page shows has no statistics: it was not requested, so none arrived.
             stats = {
                 name: one
                 for name, one in stats.items()

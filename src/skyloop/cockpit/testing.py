@@ -7,7 +7,7 @@
     print(pages.frames, pages.newest_age_s)
 
 Each page opens the telemetry and video of one drone and acknowledges every frame, as a page in a browser does after
-drawing it. Nothing is decoded, because drawing costs the cockpit nothing.
+drawing the frame. Nothing is decoded, because drawing happens in the browser and costs the cockpit nothing.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STARTS_WITHIN_S: Final = 10.0
 
 
 class HeadlessPage:
-    """One page that shows one drone. Used on one event loop; the counts may be read on any thread."""
+    """One page that shows one drone. Must be used on one event loop; the counts may be read on any thread."""
 
     def __init__(
         self,
@@ -50,15 +50,15 @@ class HeadlessPage:
         Args:
             address: Address of the cockpit, as printed.
             drone: The drone's name.
-            cameras: The cameras to watch; the first one by default.
+            cameras: The cameras to watch, by default only the first one.
             token: A token, if the cockpit requires one.
             tls: TLS context for an ``https`` address.
-            draw_s: Simulated time that it takes to draw a frame [s].
+            draw_s: The simulated time it takes to draw a frame [s].
         """
         self.drone = drone
         self.states = 0  #: number of telemetry messages
         self.frames = 0
-        self.bytes = 0  #: total size of all frames
+        self.bytes = 0  #: total size of all frames received
         self.newest_age_s: float | None = None  #: age of the newest frame on arrival, if both ends share a clock
         self.vehicle: dict[str, Any] = {}
         self.state: dict[str, Any] = {}  #: the newest state
@@ -130,10 +130,10 @@ def unpack_head(message: bytes) -> dict[str, Any]:
 
 
 class Pages:
-    """Several pages on one separate thread; a context manager for programs that don't use asyncio.
+    """Several pages on a separate thread; a context manager for programs that don't use asyncio.
 
-    Entering it waits until each page has its first state, and raises :class:`LinkError` if that takes longer than
-    :data:`STARTS_WITHIN_S`.
+    Entering it waits until each page has received its first state; if this takes longer than :data:`STARTS_WITHIN_S`,
+    :class:`LinkError` is raised.
     """
 
     def __init__(self, address: str, drone: str, count: int = 1, **options: Any) -> None:
@@ -146,7 +146,7 @@ class Pages:
             **options: Other arguments of :class:`HeadlessPage`.
         """
         self.clients = [HeadlessPage(address, drone, **options) for _ in range(count)]
-        self.problem: BaseException | None = None  #: why the pages ended, if they did
+        self.problem: BaseException | None = None  #: the error that ended the pages, if any
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
         self._changed = threading.Event()
@@ -159,16 +159,16 @@ class Pages:
 
     @property
     def newest_age_s(self) -> float | None:
-        """The largest age among the pages' newest frames [s]; None if a page had no frame."""
+        """The largest age of any page's newest frame [s]; None if a page has received no frame."""
         ages = [client.newest_age_s for client in self.clients]
         known = [age for age in ages if age is not None]
         return max(known) if known and len(known) == len(ages) else None
 
     def __enter__(self) -> Self:
-        """Open the pages and wait until each has its first state.
+        """Open the pages and wait until each of them has received its first state.
 
         Raises:
-            LinkError: It takes longer than :data:`STARTS_WITHIN_S`.
+            LinkError: Opening the pages takes longer than :data:`STARTS_WITHIN_S`.
         """
         self._thread.start()
         self._changed.wait(STARTS_WITHIN_S)
@@ -180,7 +180,7 @@ class Pages:
     def close(self) -> None:
         """Close all pages. Idempotent."""
         if self._loop is not None and self._stop is not None and not self._loop.is_closed():
-            with suppress(RuntimeError):  # the loop has just been closed
+            with suppress(RuntimeError):  # the loop was closed just now
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
 

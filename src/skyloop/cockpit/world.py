@@ -1,6 +1,6 @@
-"""A drone's surroundings: the scenery, where it may fly, where its cameras point; and whether the drone is ready.
+"""A drone's surroundings: the scenery, where it may fly, and where its cameras point; also whether the drone is ready.
 
-All requests are read-only.
+All of these requests are read-only.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Return a drone's surroundings for maps. This queries its proxy and waits for the answers.
+    """Return a drone's surroundings for maps. This function queries the drone's proxy and waits for the answers.
 
-    ``given``: the scenery to use if the drone reports none.
+    ``given``: the scenery to use if the drone does not report any.
     """
     read = _reader(drone)
     known = _known(read(WORLD))
@@ -57,7 +57,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 
 
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
-    """Return the proxy's objections to flying straight to a place from the drone's position.
+    """Return the proxy's objections to a straight flight from the drone's position to a place.
 
     ``place``: the place, in world axes [m].
     """
@@ -73,7 +73,7 @@ def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
 
 
 def space_from(read: Callable[[str], Value | None]) -> Space:
-    """Return the space in which parameters allow a vehicle to fly; a missing parameter means no limit."""
+    """Return the space in which a vehicle's parameters allow it to fly; a missing parameter means no limit."""
 
     def edge(name: str) -> float:
         value = read(name)
@@ -86,11 +86,11 @@ def space_from(read: Callable[[str], Value | None]) -> Space:
     try:
         return space_of(edge, text)
     except ParameterError:
-        return Space()  # the driver uses these parameter names for other values
+        return Space()  # this driver uses these parameter names for other values
 
 
 def geometry_values(world: WorldGeometry | None) -> Json:
-    """Convert a world's scenery to JSON values; lists are empty if nothing is known."""
+    """Convert a world's scenery to JSON values; the lists are empty if nothing is known."""
     if world is None:
         return {"name": "", "room": None, "solids": [], "gates": [], "markers": [], "starts": [], "left_out": 0}
     room = None
@@ -131,7 +131,7 @@ def _newest(drone: Drone) -> Feedback | None:
 def _reader(drone: Drone) -> Callable[[str], Value | None]:
     """Return a function that reads a parameter's value, or None if there is no such parameter."""
     found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
-    # A replay's own proxy has meaningless limits and zones, so show those of the recorded vehicle.
+    # A replay's own proxy has meaningless limits and zones, so the recorded vehicle's are shown instead.
     prefix = RECORDED if drone.uri.startswith("replay:") else ""
     return lambda name: found.get(prefix + name)
 
@@ -142,7 +142,7 @@ def _known(text: Value | None) -> WorldGeometry | None:
     try:
         return decode_world(text)
     except ValueError:
-        return None  # the driver uses this parameter name for another value
+        return None  # this driver uses the parameter name for another value
 
 
 def _limit(value: Value | None) -> float | None:
@@ -168,13 +168,13 @@ def _fields(thing: Any) -> Json:
 
 
 _OURS: Final = PreflightFinding("control", Level.OK, "a page of this cockpit has control")
-MAX_ASKING: Final = 4  #: simultaneous requests to drones; each may block its thread for seconds
+MAX_ASKING: Final = 4  #: maximum number of parallel requests to drones; each may block its thread for seconds
 
 
 class WorldApi:
-    """The routes ``world``, ``way`` and ``preflight`` of each drone.
+    """The routes ``world``, ``way`` and ``preflight`` for each drone.
 
-    ``given``: the surroundings of drones that don't report any.
+    ``given``: the surroundings used for drones that report none.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
@@ -192,18 +192,18 @@ class WorldApi:
 
     @answered
     async def world(self, request: Request) -> Response:
-        """Answer with a drone's surroundings for maps."""
+        """Respond with a drone's surroundings for maps."""
         return await self._ask(request, lambda drone: world_values(drone, self._given))
 
     @answered
     async def way(self, request: Request) -> Response:
-        """Answer with the objections to flying straight to a place, ``?to=X,Y,Z``."""
+        """Respond with the objections to a straight flight to a place, ``?to=X,Y,Z``."""
         place = _place(request.query_params.get("to", ""))
         return await self._ask(request, lambda drone: way_values(drone, place))
 
     @answered
     async def preflight(self, request: Request) -> Response:
-        """Answer with the preflight checklist."""
+        """Respond with the preflight checklist."""
         folder = self._recordings.folder
         station = self._fleet.stations.get(request.path_params["name"])
         ours = station is not None and bool(station.view.overview()["me"])
@@ -215,7 +215,7 @@ class WorldApi:
         return await self._ask(request, check)
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
-        """Query a drone on a thread, because its answer may take a while."""
+        """Query a drone on a thread, because its response may take a while."""
         drone = self._fleet.station(request.path_params["name"]).drone
         async with self._asking:
             return answer_json(await asyncio.to_thread(question, drone))

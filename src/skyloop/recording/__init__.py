@@ -1,4 +1,4 @@
-"""Flight recordings: :func:`record` writes them to MCAP files, which other viewers can open too."""
+"""Flight recordings: :func:`record` writes them to MCAP files, which other viewers can also open."""
 
 from __future__ import annotations
 

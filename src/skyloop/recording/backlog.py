@@ -17,19 +17,19 @@ RESERVE: Final = 64 * MB  #: additional bytes, reserved for samples that must no
 class Rank(IntEnum):
     """The order in which samples are dropped, highest rank first."""
 
-    KEPT = 0  #: commands, events, parameters, logs: dropped only if the reserve is full as well
+    KEPT = 0  #: commands, events, parameters, logs: dropped only if the reserve is also full
     STATE = 1  #: feedback, annotations
     FRAME = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A sample to write: a type from :mod:`skyloop.messages`, one from the layout, or an encoded frame."""
+    """A sample to write: an object of a type from :mod:`skyloop.messages` or from the layout, or an encoded frame."""
 
     drone: int  #: the drone's index in the recording
     channel: str  #: the channel's name in the drop counts: ``feedback``, ``video.front`` …
     rank: Rank
-    received_ns: int  #: time of reception on this process's monotonic clock
+    received_ns: int  #: time of reception, on this process's monotonic clock
     sample: Any
     size: int  #: approximate size [bytes]
 
@@ -66,7 +66,7 @@ class Backlog:
                 self._make_room()
 
     def put_back(self, items: Iterable[Item]) -> None:
-        """Return the most recently taken items, which could not be written, to the front in their original order."""
+        """Put the most recently taken items, which could not be written, back at the front in their original order."""
         with self._lock:
             first = self._first()
             for number, item in enumerate(reversed(list(items)), 1):
@@ -75,7 +75,7 @@ class Backlog:
             self._make_room()
 
     def take(self, size: int) -> list[Item]:
-        """Remove and return the oldest items, up to ``size`` bytes in total, in order of arrival. Does not block."""
+        """Remove and return the oldest items, in order of arrival, up to ``size`` bytes in total. Does not block."""
         taken: list[Item] = []
         with self._lock:
             while size > 0:
@@ -100,6 +100,6 @@ class Backlog:
         kept, state, frames = self._queues
         for queue, limit in ((frames, self._limit), (state, self._limit), (kept, self._ceiling)):
             while self._size > limit and queue:
-                _, item = queue.popleft()  # drop the oldest, so that the remaining ones have no gaps
+                _, item = queue.popleft()  # drop the oldest item, so that the remaining ones have no gaps
                 self._size -= item.size
                 self.dropped[item.drone, item.channel] += 1

@@ -1,6 +1,6 @@
 """Encode messages in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, text.
 
-Pure. Needs the extra ``record``. Times are in Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
+Pure. Needs the extra ``record``. Times are in Unix ns; frame names are those of :mod:`skyloop.recording.layout`.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ __all__ = [
     "PosesInFrame",
 ]
 
-LINE_WIDTH: Final = 2.0  # width in pixels
+LINE_WIDTH: Final = 2.0  # line width in pixels
 FONT_SIZE: Final = 14.0
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 
 
 def schema(message: type[Message]) -> bytes:
-    """Return the file descriptor set of a message with all its dependencies, as MCAP requires."""
+    """Return the file descriptor set of a message, including all its dependencies, as MCAP requires."""
     found = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -125,7 +125,7 @@ def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
 def pose(feedback: Feedback) -> Pose | None:
     """Return the vehicle's pose in world axes, or None while its attitude is unknown.
 
-    If the position is unknown, place it above the origin at its altitude, so that at least attitude and height show.
+    If the position is unknown, place the drone above the origin, so that at least its attitude and height are visible.
     """
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None
@@ -142,7 +142,7 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_of(values: Sequence[float]) -> Pose:
-    """Build a pose from a position [m] and a quaternion, given as x, y, z, qx, qy, qz, qw."""
+    """Build a pose from a position [m] and a quaternion, in the order x, y, z, qx, qy, qz, qw."""
     x, y, z, qx, qy, qz, qw = values[:7]
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 

@@ -1,8 +1,8 @@
 """A WebSocket server for Foxglove: live topics with the same schemas as recordings, and the drones' parameters.
 
-The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends on its own threads and
-drops the oldest messages for a viewer that does not read. Any viewer can read parameters; writing one briefly acquires
-a lease.
+The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends on its own threads, and
+drops the oldest messages if a viewer does not read. Any viewer can read parameters; writing one acquires a lease for a
+short time.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class FoxgloveServer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address to listen on.
-            port: Port to listen on; 0 picks a free one.
-            priority: Priority used for viewers' parameter writes, 0 (the highest) to 31; None forbids writing.
+            port: Port to listen on; 0 selects a free port.
+            priority: Priority used for viewers' parameter writes, from 0 (highest) to 31; None forbids writing.
 
         Raises:
             UsageError: Two drones have the same name, or other machines would be able to write parameters.
@@ -74,19 +74,19 @@ class FoxgloveServer:
         ]
         self._lock = threading.Lock()  # guards the next three attributes, which are modified on viewers' threads
         self._viewers: Counter[str] = Counter()  # number of viewers per topic
-        self._began: set[str] = set()  # topics with a new subscriber
-        self._starts: set[str] = set()  # topics with their first subscriber
+        self._began: set[str] = set()  # topics that have just gained a new subscriber
+        self._starts: set[str] = set()  # topics that have just gained their first subscriber
         self._known: dict[str, tuple[ViewTopic, tuple[Source, ...]]] = {}
         for number, drone in enumerate(drones):
             for topic in topics(drone.name, drone.capabilities, far=Known(drone).is_far):
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
         self._chains: dict[str, Chain] = {}  # H.264 frames sent to viewers so far, by topic
-        self._ready = threading.Event()  # set once ``self._server`` exists, because viewers may connect before that
+        self._ready = threading.Event()  # set once ``self._server`` exists, because viewers may connect earlier
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
         self._parameters = ParameterAccess(drones, priority, self._parameter_changed)
-        self._guard: OriginGuard | None = None  # set if parameters can be written; otherwise any web page could connect
+        self._guard: OriginGuard | None = None  # set if parameters can be written: any web page could connect otherwise
         hidden = hidden_host()
         try:
             if priority is not None:
@@ -104,8 +104,8 @@ class FoxgloveServer:
             if self._guard is not None:
                 self._guard.close()
             raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
-        # The SDK would log to Python while holding its own locks and deadlock: another thread may be waiting for one of
-        # these locks while it holds the GIL.
+        # The SDK would log to Python while holding its own locks, and deadlock: another thread that holds the GIL may
+        # be waiting for one of these locks.
         self._sdk._foxglove_py.disable_logging()
         self.host = host
         self.port: int = self._server.port
@@ -156,14 +156,14 @@ class FoxgloveServer:
             channel.close()
 
     def _show_known(self, began: set[str]) -> None:
-        """Send new subscribers what is already known: parameters, mountings, calibrations."""
+        """Send new subscribers the data already known: parameters, mountings and calibrations."""
         for translator in self._translators:
             for message in translator.prelude(monotonic_ns()):
                 if message.topic in began:
                     self._send(message)
 
     def _decodable(self, message: Message, picture: Picture) -> bool:
-        """Return whether viewers can decode a message, given those already sent; a key frame must come first."""
+        """Return whether viewers can decode a message, given the messages already sent; a key frame must come first."""
         record = picture.record
         if record.format != H264 or message.kind is not CompressedVideo:
             return True
@@ -189,7 +189,7 @@ class FoxgloveServer:
             topic.name, schema=described, message_encoding=schema.message_encoding, context=self._context
         )
 
-    # On the SDK's threads, as it calls its listener; it only logs exceptions raised here ------------------------------
+    # On the SDK's threads, which call the listener; the SDK only logs exceptions raised here --------------------------
 
     def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
         """Register a viewer's subscription."""
@@ -205,7 +205,7 @@ class FoxgloveServer:
             self._viewers[channel.topic] -= 1
 
     def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
-        """Return the named parameters, or all."""
+        """Return the named parameters, or all parameters."""
         self._ready.wait()
         self._parameters.follow()
         try:
@@ -216,7 +216,7 @@ class FoxgloveServer:
         return [self._parameter(name, value) for name, value in found.items()]
 
     def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:  # noqa: ARG002
-        """Write parameters and return the values they have afterwards."""
+        """Write parameters and return their values afterwards."""
         self._ready.wait()
         found = []
         for each in parameters:
@@ -270,9 +270,9 @@ class ViewTopic:
     """A topic that viewers can subscribe to."""
 
     name: str
-    kind: type[Any]  #: class of the topic's messages, see :class:`skyloop.recording.translation.Message`
-    channels: tuple[str, ...]  #: the drone's channels that the topic needs; empty for state known in advance
-    at_once: bool = True  #: whether the topic is announced before its first message
+    kind: type[Any]  #: class of the topic's messages; see :class:`skyloop.recording.translation.Message`
+    channels: tuple[str, ...]  #: the drone's channels that the topic needs; empty for state that is known in advance
+    at_once: bool = True  #: whether the topic is advertised before its first message
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
@@ -315,7 +315,7 @@ class Written:
 
     name: str  #: parameter name, prefixed with the drone's name
     value: Value | None  #: the current value; None if it could not be read
-    refused: str = ""  #: why the write was refused; empty if it succeeded
+    refused: str = ""  #: why the write was refused; empty if the write succeeded
 
 
 class ParameterAccess:
@@ -331,18 +331,18 @@ class ParameterAccess:
 
         Args:
             drones: Observed drones, with distinct names.
-            priority: Priority used for writes, 0 (the highest) to 31; None forbids writing.
+            priority: Priority used for writes, from 0 (highest) to 31; None forbids writing.
             on_change: Called with a parameter's name and value on a separate thread: once for each parameter when
-                :meth:`follow` is called, then after each change.
+            :meth:`follow` is called, and then after each change.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
         self._on_change = on_change
-        self._lock = threading.Lock()  # serialises writes and the start of following
+        self._lock = threading.Lock()  # serialises writes with the start of following
         self._following: list[tuple[Parameters, Listener[Event]]] = []
 
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
-        """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not answer.
+        """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not respond.
 
         Raise ``SkyloopError`` if a drone does not answer.
         """
@@ -357,7 +357,7 @@ class ParameterAccess:
         return {name: value for name, value in found.items() if not wanted or name in wanted}
 
     def write(self, name: str, value: object) -> Written:
-        """Write a parameter and return the value it has afterwards."""
+        """Write a parameter and return its value afterwards."""
         refused = ""
         with self._lock:
             try:
@@ -367,7 +367,7 @@ class ParameterAccess:
             return Written(name, self._present(name), refused)
 
     def follow(self) -> None:
-        """Report every parameter, then every change. Idempotent."""
+        """Report every parameter once, then every change. Idempotent."""
         with self._lock:
             if self._following:
                 return
@@ -377,7 +377,7 @@ class ParameterAccess:
                 followed.start()
 
     def close(self) -> None:
-        """Stop reporting changes."""
+        """Stop the reporting of changes."""
         for followed, listener in self._following:
             listener.cancel()
             followed.stop()
@@ -409,7 +409,7 @@ class ParameterAccess:
 
 
 def _typed(parameter: Parameter, value: object) -> object:
-    """Convert a viewer's value to the parameter's type: viewers send 1 for 1.0."""
+    """Convert a viewer's value to the parameter's type, because viewers send 1 for 1.0."""
     if parameter.type is ParameterType.FLOAT and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if parameter.type is ParameterType.INT and isinstance(value, float) and value.is_integer():
@@ -439,7 +439,7 @@ def is_trusted(origin: str) -> bool:
         return True
     if parts.scheme in ("http", "https"):
         return is_loopback(name)
-    return parts.scheme == "file"  # Foxglove's desktop application; the origin "null" could be any page
+    return parts.scheme == "file"  # Foxglove's desktop application; the origin "null", in contrast, could be any page
 
 
 def hidden_host() -> str:
@@ -450,9 +450,9 @@ def hidden_host() -> str:
 
 
 class OriginGuard:
-    """Listens until :meth:`close` and forwards connections from trusted origins to the server.
+    """Listens until :meth:`close` is called, and forwards connections from trusted origins to the server.
 
-    ``port``: port to listen on; 0 picks a free one. Raise ``OSError`` if listening on the address failed.
+    ``port``: port to listen on; 0 selects a free one. Raise ``OSError`` if listening on the address failed.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -470,17 +470,17 @@ class OriginGuard:
 
             def handle_error(self, request: Any, client_address: Any) -> None: ...
 
-        #: address and port of the server behind it; set before the port is announced
+        #: address and port of the server behind the guard; set before the port is announced
         self.behind: tuple[str, int] = ("", 0)
         self._server = Server((host, port), Visitor)
-        self.port = int(self._server.server_address[1])  #: port that it listens on
+        self.port = int(self._server.server_address[1])  #: port that the guard listens on
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
         )
         self._thread.start()
 
     def close(self) -> None:
-        """Stop accepting connections. Existing ones end when the server does."""
+        """Stop accepting connections. Existing connections end when the server stops."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

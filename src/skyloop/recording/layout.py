@@ -40,10 +40,10 @@ JSON: Final = "json"  #: message encoding of Skyloop's own samples
 JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of Skyloop's own samples
 PROTOBUF: Final = "protobuf"  #: both message and schema encoding of messages for viewers
 
-# Names of the metadata records. All their values are strings; see :class:`ClockPair` and :class:`Start`.
+# Names of the metadata records. All values in these records are strings; see :class:`ClockPair` and :class:`Start`.
 META_CLOCK: Final = "skyloop.clock"
 META_RECORDING: Final = "skyloop.recording"
-META_END: Final = "skyloop.end"  #: name of the metadata at the end, absent if the file was not closed
+META_END: Final = "skyloop.end"  #: name of the metadata record at the end; absent if the file was not closed
 
 LOG: Final = "/log"  #: topic of foxglove.Log for all drones: events and log text
 TF: Final = "/tf"  #: topic of foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
@@ -59,8 +59,8 @@ _LAST_UNIX_NS: Final = 2**63 - 1  #: largest 64-bit time, in the year 2262
 class ClockPair(msgspec.Struct, frozen=True):
     """Metadata ``skyloop.clock``: one moment read on both of the recorder's clocks.
 
-    A message's ``log_time`` is when it was received, ``publish_time`` when it was captured (sent, published). This pair
-    converts both to Unix time [ns]. Times *within* Skyloop's samples stay on the proxy's monotonic clock.
+    A message's ``log_time`` is when it was received; its ``publish_time`` is when it was captured (sent, published).
+    This pair converts both to Unix time [ns]. Times *within* Skyloop's samples stay on the proxy's monotonic clock.
     """
 
     monotonic_ns: int
@@ -76,7 +76,7 @@ class ClockPair(msgspec.Struct, frozen=True):
         return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is that monotonic clock minus the recorder's.
+        """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is that time's clock minus the recorder's.
 
         The result is clamped to the range that a file can hold, so that a sample with an absurd time can't corrupt it.
         """
@@ -100,7 +100,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
     @property
     def described(self) -> Capabilities:
-        """Decode the drone's capabilities. Raise ``FileFormatError`` if they can't be decoded."""
+        """Decode the drone's capabilities. Raise ``FileFormatError`` if the capabilities can't be decoded."""
         return from_plain(self.capabilities, Capabilities)
 
 
@@ -116,7 +116,7 @@ class Start(msgspec.Struct, frozen=True):
 
 
 class End(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.end``, written at the end of a closed file. Losses count from the start of the recording."""
+    """Metadata ``skyloop.end``, written at the end of a closed file. Losses are counted from the recording's start."""
 
     reason: str  #: ``closed``, or ``rotated`` if another file follows
     ended_unix_ns: int
@@ -154,7 +154,7 @@ def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
 
 
 class Channel(StrEnum):
-    """Skyloop's own channels; topics are ``/NAME/CHANNEL``, for frames ``/NAME/frames/CAMERA``."""
+    """Skyloop's own channels; topics are ``/NAME/CHANNEL``, or ``/NAME/frames/CAMERA`` for frames."""
 
     FEEDBACK = "feedback"
     COMMANDS = "commands"
@@ -168,14 +168,14 @@ class Channel(StrEnum):
 
 
 class FrameRecord(msgspec.Struct, frozen=True):
-    """A recorded frame. Its image is a separate message with the same sequence number and times.
+    """A recorded frame. The image of the frame is a separate message with the same sequence number and times.
 
     The image is on the topic given by :func:`image_topic` or, for H.264, by :func:`video_topic`.
     """
 
     header: FrameHeader  #: header as received
     received_ns: int  #: time of reception on the recorder's monotonic clock
-    format: str  #: the image's format in the file: ``jpeg``, ``png``, ``h264``
+    format: str  #: format of the image in the file: ``jpeg``, ``png`` or ``h264``
     key: bool = True  #: whether it can be decoded on its own; false only for some ``h264`` frames
 
 
@@ -187,8 +187,8 @@ class ResultRecord(msgspec.Struct, frozen=True):
     number: int
     camera: str
     seq: int  #: the frame's sequence number
-    captured_ns: int  #: when the frame was captured
-    made_ns: int  #: when the result was completed, on the proxy's clock
+    captured_ns: int  #: time at which the frame was captured
+    made_ns: int  #: time at which the result was completed, on the proxy's clock
     took_ns: int
     value: Any = None
 
@@ -228,7 +228,7 @@ class Topic:
 
 
 def parse_topic(topic: str) -> Topic | None:
-    """Parse one of Skyloop's own topics; return None for any other topic."""
+    """Parse one of Skyloop's own topics; return None for all other topics."""
     parts = [_unquoted(part) for part in topic.split("/")]
     if len(parts) not in (3, 4) or parts[0] or parts[2] not in set(Channel):
         return None

@@ -1,4 +1,4 @@
-"""The recordings of a folder, also where the extra ``record`` is not installed."""
+"""Describe the recordings in a folder, even if the extra ``record`` is not installed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ ENDING: Final = ".mcap"
 class Described(msgspec.Struct, frozen=True):
     """A summary of a recording."""
 
-    started: float | None = None  #: Unix time [s]; None if unknown
+    started: float | None = None  #: Unix time [s], or None if unknown
     drones: tuple[str, ...] = ()
     seconds: float | None = None  #: time from the first message to the last
-    problem: str = ""  #: why it is unreadable or incomplete; empty if it is complete
+    problem: str = ""  #: reason why it is unreadable or incomplete; empty if it is complete
 
 
 def shown_name(path: Path) -> str:
-    """Return a file's name as text, with non-UTF-8 bytes in hexadecimal."""
+    """Return a file's name as text, with bytes that are not UTF-8 in hexadecimal."""
     return os.fsencode(path.name).decode(errors="backslashreplace")
 
 

@@ -67,7 +67,7 @@ class Options(msgspec.Struct, frozen=True):
         return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
-        """Check that the chosen cameras exist. Raise ``UnknownNameError`` if no drone has a camera of that name."""
+        """Check that the chosen cameras exist. Raise ``UnknownNameError`` if no drone has a camera with that name."""
         cameras = set(known)
         for name in self.channels:
             kind, dot, camera = name.partition(".")
@@ -78,8 +78,8 @@ class Options(msgspec.Struct, frozen=True):
 def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
     """Convert the caller's choice of channels to names from :data:`CHOICES`.
 
-    ``names``: one name or several; ``command`` means ``commands``. None selects all. Raise ``UnknownNameError`` if a
-    channel does not exist, or ``UsageError`` if no channel was given.
+    ``names``: one name or several; ``command`` means ``commands``. None selects all channels. Raise
+    ``UnknownNameError`` if a channel does not exist, and ``UsageError`` if no channel was given.
     """
     if names is None:
         return CHOICES
@@ -100,14 +100,14 @@ def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """Return the path of a recording's file with this number, such as ``flight-0002.mcap``."""
+    """Return the path of the recording's file with this number, such as ``flight-0002.mcap``."""
     return path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
     """Return the path to record to: the file (``.mcap`` by default) or, in a folder, one named after drones and time.
 
-    Raise ``UsageError`` if the file already exists, or its folder does not.
+    Raise ``UsageError`` if the file already exists or its folder does not.
     """
     if path.is_dir():
         path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
@@ -129,24 +129,24 @@ class RecorderState(StrEnum):
 
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  #: the disk can't be written to; essential samples wait, and writing is retried each second
+    PAUSED = "paused"  #: the disk can't be written to; essential samples wait, and the write is retried every second
     CLOSED = "closed"  #: closed intentionally; the file is complete
-    FAILED = "failed"  #: its process was killed, or an error ended its thread; the data written so far are in the file
+    FAILED = "failed"  #: its process was killed, or an error ended its thread; data already written remains in the file
 
 
 class Status(msgspec.Struct, frozen=True):
     """The status of a recording at one moment."""
 
     state: RecorderState = RecorderState.STARTING
-    reason: str = ""  #: why it is paused, has failed or is leaving frames out
-    path: str = ""  #: the current file or, if there is none, the last one
+    reason: str = ""  #: reason why it is paused, has failed or is leaving frames out
+    path: str = ""  #: the current file or, if there is none, the previous one
     files: tuple[str, ...] = ()  #: all files, oldest first
-    seconds: float = 0.0  #: time since the start
+    seconds: float = 0.0  #: time since recording started
     bytes: int = 0  #: total size of all files
     messages: int = 0
-    waiting: int = 0  #: number of bytes received but not yet written
+    waiting: int = 0  #: number of bytes that have been received but not written yet
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
-    missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel
+    missed: dict[str, dict[str, int]] = {}  #: samples that were never received, by drone and channel
 
 
 class RecorderEvent(msgspec.Struct, frozen=True):
@@ -157,7 +157,7 @@ class RecorderEvent(msgspec.Struct, frozen=True):
 
 
 class Room(StrEnum):
-    """The samples that are still written as the disk fills up."""
+    """The samples that are still written when the disk is nearly full."""
 
     ALL = "all"
     NO_FRAMES = "no frames"
@@ -170,7 +170,7 @@ _MARGIN: Final = 1.25  #: free space required before writing resumes, as a multi
 def judge_room(free: int, floor: int, before: Room) -> Room:
     """Decide what to write: everything above the floor, no frames below it, nothing below a quarter of it.
 
-    To write more than ``before``, the free space must exceed the limit by a margin.
+    To write more than ``before``, the free space must exceed the limit by an extra margin.
     """
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:

@@ -1,7 +1,7 @@
-"""A recorded frame and its pixels: JPEG, PNG, or H.264, whose frames depend on each other and are decoded on demand.
+"""A recorded frame and its pixels: JPEG, PNG or H.264. H.264 frames depend on each other and are decoded on demand.
 
 The image is in the field ``data`` of a foxglove.CompressedImage or, if the vehicle's H.264 was kept, of a
-foxglove.CompressedVideo. It is extracted from the Protocol Buffers encoding
+foxglove.CompressedVideo. The data are extracted from the Protocol Buffers encoding
 (https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image,
 …/compressed-video).
 """
@@ -35,10 +35,10 @@ class Picture:
 
     camera: str
     record: FrameRecord
-    log_ns: int  #: when it was received, Unix time [ns]
-    publish_ns: int  #: when it was captured, Unix time [ns]
+    log_ns: int  #: time at which it was received, Unix time [ns]
+    publish_ns: int  #: time at which it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: the frame's group and its index there, if it is decodable H.264
+    group: tuple[Group, int] | None = None  #: the frame's group and its index in it, for decodable H.264
 
     @property
     def header(self) -> FrameHeader:
@@ -56,7 +56,7 @@ class Picture:
 
     @property
     def can_be_decoded(self) -> bool:
-        """Whether all frames that it depends on are known; false for H.264 whose key frame is missing."""
+        """Whether all frames that this one depends on are known; false for H.264 whose key frame is missing."""
         return self.record.format != H264 or self.group is not None
 
     def pixels(self) -> NDArray[np.uint8]:
@@ -69,7 +69,7 @@ class Picture:
         return self._decoded(grey=False)
 
     def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
-        """Decode the frame to the vehicle's own encoding if that was raw, otherwise to BGR.
+        """Decode the frame to the vehicle's own encoding if that encoding was raw, otherwise to BGR.
 
         Raises:
             FileFormatError: The frame can't be decoded.
@@ -160,13 +160,13 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
 
 
 class Group:
-    """A key frame and the frames that depend on it, in order of capture. Decoding resumes where it last stopped."""
+    """A key frame and the frames that depend on it, in the order of capture. Decoding resumes where it stopped."""
 
     def __init__(self) -> None:
         self._units: list[bytes] = []
         self._context: VideoCodecContext | None = None
         self._done = 0  # number of units decoded so far
-        self._image: Any = None  # image decoded last
+        self._image: Any = None  # the most recently decoded image
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -185,7 +185,7 @@ class Group:
         """
         if self._context is None or index < self._done - 1:
             self._context, self._done = new_decoder("h264", "decoding recorded H.264"), 0
-        while self._done <= index and (self._done == 0 or self._image is not None):  # damage ends the group
+        while self._done <= index and (self._done == 0 or self._image is not None):  # damage ends the group of frames
             self._image = _decode(self._context, self._units[self._done])
             self._done += 1
         if self._image is None:
@@ -194,7 +194,7 @@ class Group:
 
 
 class Groups:
-    """Sorts one camera's frames, passed in order, into groups."""
+    """Sorts one camera's frames, which are passed in order, into groups."""
 
     def __init__(self) -> None:
         self._chain = Chain()

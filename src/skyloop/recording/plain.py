@@ -1,4 +1,4 @@
-"""Convert Skyloop's own samples to JSON objects with a schema, and back; and read their times. Pure, without MCAP.
+"""Convert Skyloop's own samples to JSON objects with a schema and back, and read their times. Pure; does not use MCAP.
 
 The keys are the field names of the sample's class. Unknown values are absent, numbers that are not finite are null, and
 an extra key (``action``, ``shape``) distinguishes the members of a union.
@@ -32,7 +32,7 @@ from skyloop.messages import (
 
 T = TypeVar("T")
 
-MAX_DEPTH: Final = 64  #: maximum nesting of lists and objects in a sample; processors' results use a handful of levels
+MAX_DEPTH: Final = 64  #: maximum nesting of lists and objects in a sample; processors' results use a few levels
 MIN_INT: Final = -(1 << 63)
 MAX_INT: Final = (1 << 63) - 1
 
@@ -48,7 +48,7 @@ def decode(data: bytes | memoryview, kind: type[T]) -> T:
 
 
 def from_json(data: bytes | memoryview | str) -> Any:
-    """Decode arbitrary JSON. Raise ``FileFormatError`` if the data are not JSON, or nested too deeply."""
+    """Decode arbitrary JSON. Raise ``FileFormatError`` if the data are not JSON or are nested too deeply."""
     try:
         return msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -114,10 +114,10 @@ def from_plain(plain: Any, kind: type[T]) -> T:
 
 
 def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
-    """Return a JSON value unchanged if other programs can read it and it is nested at most ``depth`` levels deep.
+    """Return a JSON value unchanged if other programs can read it and it has at most ``depth`` levels of nesting.
 
-    Raise ``ValueError`` if an integer has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
-    nested too deeply.
+    Raise ``ValueError`` if an integer has more than 64 bits, which neither NumPy nor a packet can hold, or if the value
+    is nested too deeply.
     """
     if isinstance(value, dict | list):
         if depth <= 0:
@@ -209,7 +209,7 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
             return structs[value[key]][1](value)
         if only is not None:
             restored = only(value)
-            # A vector with an unknown component is unknown as a whole; our own samples hold only finite numbers.
+            # A vector with an unknown component is unknown as a whole; our own samples contain only finite numbers.
             unknown = nothing is None and isinstance(restored, list) and any(one != one for one in restored)
             return None if unknown else restored
         return (
@@ -229,11 +229,11 @@ def schema_name(kind: type[msgspec.Struct]) -> str:
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """Return a sample's JSON schema, limited to what viewers understand: no references and no unions.
+    """Return a sample's JSON schema, limited to what viewers can interpret: no references and no unions.
 
     (Foxglove and Lichtblick require "type": "object" at the root and one type for each property and item.) A property
-    with several possible types, such as a parameter's value, is therefore not listed; the schema allows unlisted ones.
-    The description is the first line of the class's docstring.
+    with several possible types, such as a parameter's value, is therefore not listed; the schema allows unlisted
+    properties. The description is the first line of the class's docstring.
     """
     info = inspect.type_info(kind)
     described = {"title": schema_name(kind), "description": (kind.__doc__ or "").partition("\n")[0], **_schema_of(info)}
@@ -294,19 +294,19 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
 
 # Times ----------------------------------------------------------------------------------------------------------
 #
-# A sample's timestamp is when the proxy received it, on the proxy's clock: the time axis of a flight. The file's
-# own timestamps are on the recorder's clock, unrelated to the flight if a replay runs in step with an application.
+# A sample's timestamp is its time of reception on the proxy's clock: the time axis of a flight. The file's own
+# timestamps are on the recorder's clock, which is unrelated to the flight if a replay runs in step with an application.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: limit for how far a sample's own time may lie before the newest one
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: limit for how far it may lie after it
+_BACK_NS: Final = 10 * NS_PER_S  #: maximum time by which a sample's own time may lie before the newest time
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: maximum time by which it may lie after the newest time
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")
 
 
 def reported_ns(value: Any) -> int | None:
-    """Return when the proxy received or published a sample; None if the sample has no time."""
+    """Return the time at which the proxy received or published a sample, or None if the sample has no time."""
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
     if isinstance(value, Applied):
@@ -315,10 +315,10 @@ def reported_ns(value: Any) -> int | None:
         return value.at_ns
     if isinstance(value, Annotation):
         return value.captured_ns
-    made_ns = getattr(value, "made_ns", None)  # found in a result's record
+    made_ns = getattr(value, "made_ns", None)  # present in the record of a result
     if made_ns is not None:
         return int(made_ns)
-    header = getattr(value, "header", None)  # found in a frame's record or picture
+    header = getattr(value, "header", None)  # present in the record or picture of a frame
     return None if header is None else int(header.published_ns)
 
 
@@ -327,26 +327,26 @@ def shifted(value: Any, shift_ns: int) -> Any:
     names = [name for name in _TIMES if getattr(value, name, 0)]
     if names:
         return msgspec.structs.replace(value, **{name: getattr(value, name) + shift_ns for name in names})
-    if (header := getattr(value, "header", None)) is not None:  # a frame's record
+    if (header := getattr(value, "header", None)) is not None:  # the record of a frame
         return msgspec.structs.replace(value, header=shifted(header, shift_ns))
     record = getattr(value, "record", None)
     return value if record is None else replace(value, record=shifted(record, shift_ns))
 
 
 class Course:
-    """Tracks the time along a recording, sample by sample: it never runs backwards and ignores a single wrong time.
+    """Tracks the time along a recording, sample by sample. It never runs backwards, and a single wrong time is ignored.
 
-    If the proxy's clock restarts because its computer rebooted, time continues from the last value, advanced by the
-    time elapsed on the recorder's clock.
+    If the proxy's clock restarts because its computer was rebooted, time continues from the last value, advanced by the
+    time that elapsed on the recorder's clock.
     """
 
     def __init__(self, shift_ns: int = 0) -> None:
-        """Start before the first sample, with a known shift if given."""
-        self.first_ns: int | None = None  #: time of the first sample that has one
+        """Start before the first sample; a shift that is already known may be given."""
+        self.first_ns: int | None = None  #: time of the first sample that has a time
         self.newest_ns = 0  #: time of the newest sample
-        #: offset currently added to the samples' own times, to compensate for restarts of the proxy's clock
+        #: offset that is currently added to the samples' own times, to compensate for restarts of the proxy's clock
         self.shift_ns = shift_ns
-        self._doubted_ns: int | None = None  # an implausible time, accepted if the next one agrees with it
+        self._doubted_ns: int | None = None  # an implausible time; accepted if the next time agrees with it
         self._log_ns = 0  # log time of the newest sample
 
     def follow(self, value: Any, log_ns: int = 0) -> int:
@@ -360,7 +360,7 @@ class Course:
         elif -_BACK_NS < own_ns - self.newest_ns < _AHEAD_NS:
             self.newest_ns = max(self.newest_ns, own_ns)
             self._doubted_ns = None if isinstance(value, Feedback) else self._doubted_ns
-        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # applications may set other samples' times
+        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # applications may set the times of other samples
             agree = self._doubted_ns is not None and abs(own_ns - self._doubted_ns) < _BACK_NS
             self._doubted_ns = own_ns
             if agree and own_ns < self.newest_ns:

@@ -29,8 +29,8 @@ class Entry:
     """One message in the file; times are Unix time [ns]."""
 
     topic: str
-    log_ns: int  #: when it was received
-    publish_ns: int  #: when it was captured
+    log_ns: int  #: time at which it was received
+    publish_ns: int  #: time at which it was captured
     sequence: int
     data: bytes
 
@@ -51,15 +51,15 @@ class Series:
 
     topic: str
     schema: str
-    own: Topic | None  #: None for viewers' topics and for those of other programs
+    own: Topic | None  #: None for topics from viewers and from other programs
 
 
 @dataclass(slots=True)
 class Recording:
     """An MCAP file recorded by Skyloop. Opening it reads the index or, if there is none, scans the file.
 
-    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where that is.
-    Unreadable parts in the middle are skipped and listed in :attr:`damaged`.
+    Each iteration reads the file again. A truncated file is read up to its end, and ``cut`` describes where it is
+    truncated. Unreadable parts in the middle are skipped and listed in :attr:`damaged`.
     """
 
     path: Path
@@ -99,7 +99,7 @@ class Recording:
 
     @property
     def cut(self) -> str:
-        """Why the file is incomplete; empty if it is complete."""
+        """The reason why the file is incomplete; empty if it is complete."""
         return self.found.cut
 
     @property
@@ -109,7 +109,7 @@ class Recording:
 
     @property
     def drones(self) -> tuple[DroneRecord, ...]:
-        """The drones of the recording."""
+        """The drones in the recording."""
         return self.start.drones
 
     def drone(self, name: str | None = None) -> DroneRecord:
@@ -168,7 +168,7 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """Time from the first message to the last."""
+        """Time between the first and last messages."""
         first, last = self.span_ns
         return (last - first) / NS_PER_S
 
@@ -177,11 +177,11 @@ class Recording:
     def entries(
         self, topics: Collection[str] | None = None, *, from_ns: int = 0, progress: Progress | None = None
     ) -> Iterator[Entry]:
-        """Yield messages in the order of their log time.
+        """Yield messages in order of their log time.
 
         Args:
-            topics: Topics to yield; None yields all.
-            from_ns: Log time to start from, Unix time [ns].
+            topics: Topics to yield, or None to yield all topics.
+            from_ns: Log time at which to start, Unix time [ns].
             progress: Called with the fraction read so far, 0 to 1.
 
         Raises:
@@ -191,7 +191,7 @@ class Recording:
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with scan.open_file(self.path) as file:
-            # Several threads feed a recorder, so a slightly older message can come later, even in the next piece.
+            # Several threads feed a recorder, so a slightly older message may appear later, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
@@ -199,7 +199,7 @@ class Recording:
                     held += (entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns)
                     held.sort(key=attrgetter("log_ns"))
                     until = len(held)
-                    if after is not None and after.start_ns > 0:  # otherwise the time of its first message is unknown
+                    if after is not None and after.start_ns > 0:  # otherwise the time of the first message is unknown
                         until = bisect_left(held, after.start_ns, key=attrgetter("log_ns"))
                     yield from held[:until]
                     held = held[until:]
@@ -214,7 +214,7 @@ class Recording:
         from_ns: int = 0,
         progress: Progress | None = None,
     ) -> Iterator[Item]:
-        """Yield Skyloop's own samples of a drone. Skip undecodable samples and note them in :attr:`damaged`.
+        """Yield Skyloop's own samples of a drone. Skip samples that can't be decoded, and list them in :attr:`damaged`.
 
         Args:
             drone: The drone's name.
@@ -262,7 +262,7 @@ class Recording:
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
-        """Decode a message from one of Skyloop's own channels; if damaged, note it in :attr:`damaged`, return None."""
+        """Decode a message from one of Skyloop's own channels; note damage in :attr:`damaged` and return None."""
         try:
             return layout.decode(entry.data, layout.TYPES[channel])
         except FileFormatError as error:
@@ -287,7 +287,7 @@ class Recording:
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
     ) -> Iterator[Item | Picture]:
-        """Yield the samples of some topics, with frames as pictures instead of records."""
+        """Yield the samples of the given topics, with frames as pictures instead of records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
             topic = topics.get(entry.topic)
@@ -312,7 +312,7 @@ class Recording:
         }
 
 
-_Kind = tuple[str, bool]  # camera, and whether the image is the vehicle's own H.264
+_Kind = tuple[str, bool]  # camera name, and whether the image is the vehicle's own H.264
 
 
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
@@ -347,7 +347,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # raised when decoding a picture without a group
+            with suppress(FileFormatError):  # raised when a picture without a group is decoded
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 

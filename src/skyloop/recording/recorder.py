@@ -43,7 +43,7 @@ _TOO_SLOW: Final = "the disk or the encoder is too slow"
 
 
 class Engine:
-    """Records drones from :meth:`start` to :meth:`stop`."""
+    """Records drones between :meth:`start` and :meth:`stop`."""
 
     def __init__(
         self,
@@ -55,8 +55,8 @@ class Engine:
     ) -> None:
         """Initialise the recorder without opening a file. ``on_event`` is called on the writing thread.
 
-        Raise ``UsageError`` if two drones have the same name, or ``UnknownNameError`` if no drone has a camera named in
-        the options.
+        Raise ``UsageError`` if two drones have the same name, and ``UnknownNameError`` if no drone has a camera named
+        in the options.
         """
         check_names(drones, "recording")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
@@ -83,8 +83,8 @@ class Engine:
     def start(self) -> None:
         """Open the file and start recording.
 
-        Raise ``UsageError`` if the file can't be written, or ``SkyloopError`` if subscribing to a drone failed; the
-        file has been closed.
+        Raise ``UsageError`` if the file can't be written, and ``SkyloopError`` if subscribing to a drone failed; the
+        file is closed by then.
         """
         self._writer.start()
         try:
@@ -136,7 +136,7 @@ class Engine:
         self._on_event(RecorderEvent(text, severity))
 
     def _publish_to(self, tap: Tap, text: str, severity: Severity) -> None:
-        """Write an event to the file and log it on the drone."""
+        """Write an event to the file and log the event on the drone."""
         tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
         tap.drone.log.text(text, name="recording", severity=severity)
 
@@ -161,7 +161,7 @@ class Engine:
 
 
 class Recorder:
-    """A recording that runs until :meth:`close` or the end of its ``with`` block. Safe to use from any thread."""
+    """A recording that runs until :meth:`close` is called or its ``with`` block ends. Safe to use from any thread."""
 
     def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
         """Start the recording. Applications call :func:`record` instead.
@@ -207,22 +207,22 @@ class Recorder:
 
     @property
     def reason(self) -> str:
-        """Why the recording is paused or has failed."""
+        """The reason why recording is paused or has failed."""
         return self.status.reason
 
     @property
     def path(self) -> Path:
-        """The current file or, if there is none, the last one."""
+        """The current file or, if there is none, the previous one."""
         return Path(self.status.path)
 
     @property
     def files(self) -> list[Path]:
-        """All files of this recording, oldest first."""
+        """All files of this recording, from oldest to newest."""
         return [Path(file) for file in self.status.files]
 
     @property
     def seconds(self) -> float:
-        """Time since the start."""
+        """Time since recording started."""
         return self.status.seconds
 
     @property
@@ -279,24 +279,24 @@ def record(
     overwrite: bool = False,
     in_process: bool | None = None,
 ) -> Recorder:
-    """Record one or several drones to an MCAP file; return once the recording is running. Use as a context manager.
+    """Record one or more drones to an MCAP file; return once the recording is running. Use as a context manager.
 
     Args:
         drones: Connected drones, or names of running proxies.
         path: A file, or a folder in which to create a file with a generated name.
         channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
-            ``video`` and ``video.CAMERA``; None records everything.
-        encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
-            ``"auto"`` keeps the vehicle's H.264 if it sends any, and otherwise encodes as JPEG.
+        ``video`` and ``video.CAMERA``; None to record everything.
+        encoding: Encoding of raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
+            ``"auto"`` keeps the vehicle's H.264 if it sends H.264, and otherwise encodes frames as JPEG.
         quality: JPEG quality, 1 to 100 (best).
-        rotate_mb: Start a new file (``flight-0001.mcap``, …) after this many megabytes, H.264 at the next key frame.
-            Each file is self-contained. None never does.
-        rotate_s: Start a new file after this many seconds; None never does.
+        rotate_mb: Start a new file (``flight-0001.mcap``, …) after this many megabytes; with H.264, at the next key
+            frame. Each file is self-contained. None never does.
+        rotate_s: Start a new file after this many seconds; None means never.
         min_free_mb: Free space to leave on the disk. Below this, no frames are recorded; below a quarter, nothing.
         buffer_mb: Amount of data held for a slow disk before frames are dropped.
         overwrite: Whether to replace an existing file.
-        in_process: Whether to record on threads of this process instead of in a separate one; None uses threads only if
-            a drone can't be reached from another process.
+        in_process: Whether to record on threads of this process instead of in a separate process. If None, threads are
+        used only if a drone can't be reached from another process.
 
     Raises:
         UsageError: An argument is invalid, or the file already exists or can't be written.
@@ -327,7 +327,7 @@ def record(
     return Recorder(several, where, options, bool(alone) if in_process is None else in_process)
 
 
-# In a process of its own -----------------------------------------------------------------------------------------
+# In a separate process --------------------------------------------------------------------------------------------
 
 
 START_S: Final = 20.0  #: time allowed for the child to start recording
@@ -351,7 +351,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 
     status: Status | None = None
     event: RecorderEvent | None = None
-    trouble: str = ""  #: why the child could not start
+    trouble: str = ""  #: reason why the child could not start
     usage: bool = False  #: whether the cause was a UsageError
 
 
@@ -365,7 +365,7 @@ def run_child(order: Order) -> int:
     on_parent_end(stop.set)
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    # Sent on this thread, so that a parent that does not read never blocks the writing thread.
+    # Events are sent on this thread, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:
         try:
@@ -391,7 +391,7 @@ def _report(engine: Engine, events: deque[RecorderEvent]) -> None:
 
 
 def _print(line: Line) -> None:
-    with contextlib.suppress(OSError):  # the parent process has ended
+    with contextlib.suppress(OSError):  # the parent process has exited
         sys.stdout.buffer.write(msgspec.json.encode(line) + b"\n")
         sys.stdout.buffer.flush()
 
@@ -403,10 +403,10 @@ class RecorderProcess:
     """A child process that records. It ends on :meth:`stop`, or when this process ends for any reason."""
 
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
-        """Start the child and wait until it records. ``on_event`` is called on the thread that reads its events.
+        """Start the child and wait until it is recording. ``on_event`` is called on the thread that reads its events.
 
         Raise ``UsageError`` if the child can't record because an argument is invalid, ``LinkError`` if the child can't
-        record for another reason, or has ended, or ``NoAnswerError`` if the child does not start in time.
+        record for another reason or has ended, and ``NoAnswerError`` if the child does not start in time.
         """
         self._on_event = on_event
         self._status = Status(path=order.path)
@@ -429,13 +429,13 @@ class RecorderProcess:
 
     @property
     def status(self) -> Status:
-        """The newest status reported by the child."""
+        """The newest status that the child reported."""
         return self._status
 
     def stop(self) -> None:
         """Have the child write all received samples and close its file, then wait for it to end. Idempotent.
 
-        A child that does not end in time is terminated, then killed.
+        If a child does not end in time, it is terminated, then killed.
         """
         self._process.end(_END_S, _HARDER_S)
         self._thread.join()
@@ -456,7 +456,7 @@ class RecorderProcess:
         for text in self._process.stdout:
             try:
                 self._take(msgspec.json.decode(text, type=Line))
-            except Exception as error:  # noqa: BLE001  (a library may print anything, a callback raise anything)
+            except Exception as error:  # noqa: BLE001 (a library may print anything, and a callback may raise anything)
                 _log.warning("the recorder's process: %r: %r", text[:200], error)
             self._bell.notify()
         self._process.wait()

@@ -66,10 +66,10 @@ PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
 _AHEAD: Final = 8 * MB  #: maximum number of bytes not yet accepted by the viewer
 _PATIENCE_S: Final = 0.5  # time to wait for a slow viewer before dropping samples
-_ASK_NS: Final = nanoseconds(1.0)  # interval between checks that the viewer keeps up
+_ASK_NS: Final = nanoseconds(1.0)  # interval between checks whether the viewer keeps up
 _LAST_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
-_LOOK_S: Final = 0.1  # interval between checks that the viewer listens
-_SETTLED_S: Final = 1.0  # time the viewer must keep listening to count as started
+_LOOK_S: Final = 0.1  # interval between checks whether the viewer is listening
+_SETTLED_S: Final = 1.0  # time for which the viewer must keep listening to count as started
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer is already listening there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -127,11 +127,11 @@ class RerunViewer:
         self._shown.connect(connect)
 
     def wanted(self) -> frozenset[Source]:
-        """Return all sources that can be drawn."""
+        """Return all drawable sources."""
         return self._channels
 
     def show(self, item: Item) -> None:
-        """Draw a sample, unless the viewer hangs: Rerun would queue all of them in memory."""
+        """Draw a sample, unless the viewer hangs, because Rerun would queue all samples in memory."""
         if not self._keeps_up(item):
             self.left_out += 1
             return
@@ -183,7 +183,7 @@ def _start(host: str, port: int) -> None:
     except OSError as error:
         raise LinkError(f"Rerun's viewer can't be started: {error}") from None
     end = time.monotonic() + _START_S
-    listening_s = 0.0  # a viewer without a display listens for a moment, then exits
+    listening_s = 0.0  # a viewer that has no display listens for a moment, then exits
     while listening_s < _SETTLED_S:
         if viewer.poll() is not None:
             raise LinkError(
@@ -191,7 +191,7 @@ def _start(host: str, port: int) -> None:
                 "show the drones in a viewer elsewhere with --connect URL"
             )
         if time.monotonic() > end:
-            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the process started here
+            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the process that was started here
             raise NoAnswerError(f"Rerun's viewer is not listening on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
         listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
@@ -231,7 +231,7 @@ class Exported:
     drones: tuple[str, ...]
     samples: int
     pictures: int
-    left_out: int  #: images that are damaged or can't be decoded
+    left_out: int  #: number of images that are damaged or can't be decoded
 
 
 def export_rrd(
@@ -241,8 +241,8 @@ def export_rrd(
 
     Args:
         recording: The recording.
-        path: The file to write; an existing one is replaced.
-        drone: The drone to export; None exports all.
+        path: The file to write; an existing file is replaced.
+        drone: The name of the drone to export, or None to export all drones.
         progress: Called with the fraction read so far, 0 to 1.
 
     Raises:
@@ -286,7 +286,7 @@ def _part_of(progress: Progress, first: float, parts: int) -> Progress:
 
 TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
-_MOST_SERIES: Final = 64  # maximum number of series and of drawing sources, because applications choose their names
+_MOST_SERIES: Final = 64  # maximum number of series and drawing sources; applications choose their names
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between points of a path
 _FRUSTUM_M: Final = 0.3  # size at which a camera is drawn
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
@@ -313,11 +313,11 @@ class RerunLog:
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
         """Initialise a recording without a destination; call :meth:`save` or :meth:`connect` next.
 
-        ``recording``: name of the recording; Rerun merges recordings with equal names. If empty, one is made up.
+        ``recording``: name of the recording; Rerun merges recordings that have the same name. If empty, one is created.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
-        self._stream.set_log_time_enabled(False)  # log time is the time of writing, which is meaningless in a recording
+        self._stream.set_log_time_enabled(False)  # log time would be the time of writing, which has no meaning here
         self._stream.set_log_tick_enabled(False)
         self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
         self._shown = drones
@@ -342,30 +342,30 @@ class RerunLog:
         self._begin()
 
     def add(self, drone: int, sample: Any) -> None:
-        """Add a sample of the drone with this index, if samples of its type are drawn."""
+        """Add a sample of the drone with this index, if samples of that type are drawn."""
         self._drones[drone].add(sample)
 
     def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
-        """Add a frame as an image file or H.264 access unit; the first H.264 frame must be a key frame."""
+        """Add a frame as an image file or an H.264 access unit; the first H.264 frame must be a key frame."""
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:
         """Return whether the viewer or disk accepts all added samples within this time [s], which must be positive."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
-        except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
+        except Exception:  # noqa: BLE001 (Rerun raises its own exceptions, which have no common base)
             return False
         return True
 
     def close(self, timeout_s: float = 5.0) -> None:
         """Finish the file, or send the remaining data to the viewer, waiting up to ``timeout_s`` [s].
 
-        Raise ``LinkError`` if the viewer did not accept the remaining data, which are dropped.
+        Raise ``LinkError`` if the viewer did not accept the remaining data, which are then dropped.
         """
         if self.taken(timeout_s):
             self._stream.disconnect()
             return
-        # Disconnecting, now or when Python exits, could wait for the viewer forever.
+        # Disconnecting, now or when Python exits, could wait forever for the viewer.
         threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
         self._rr.unregister_shutdown()
         raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs or is closed")
@@ -376,7 +376,7 @@ class RerunLog:
             drone.begin()
 
     def _blueprint(self) -> Any:
-        """Return the viewer's layout: world, cameras, plots, texts."""
+        """Return the viewer's layout: world, cameras, plots and text."""
         import rerun.blueprint as views
 
         cameras = [
@@ -568,12 +568,12 @@ class _Drone:
 
 
 def entity_of(drone: str, camera: CameraInfo) -> str:
-    """Return a camera's entity, which is in the world if its mounting is known."""
+    """Return a camera's entity; the entity is in the world if the camera's mounting is known."""
     return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
 
 
 def part(name: str) -> str:
-    """Quote a name for use as a part of an entity path."""
+    """Quote a name so that it can be part of an entity path."""
     return str(rerun_sdk().escape_entity_path_part(name))
 
 

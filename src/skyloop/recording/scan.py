@@ -1,8 +1,8 @@
-"""Find the structure of an MCAP file from its index, or by a scan if it is truncated; and read its parts.
+"""Find the structure of an MCAP file from its index, or by a scan if the file is truncated; then read its parts.
 
 The format is described at https://mcap.dev/spec: each record has an opcode, a length and that many bytes. Most are
-chunks, which hold messages. Reading stops at a record that is cut off by the end of the file; if that is a chunk, the
-part of it that exists is read.
+chunks, which hold messages. Reading stops at a record that is cut off by the end of the file; if this record is a
+chunk, the part of it that exists is read.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import IO, Any, Final
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 
-# Limits: a file of a few kilobytes could otherwise fill the memory or keep a core busy for minutes.
-#: Bytes of a chunk, packed and unpacked, and of a message outside chunks. Recorders close a chunk after 1 to 4 MB; only
-#: its last message makes it larger, and the largest is an uncompressed 4K image.
+# Limits: without them, a file of a few kilobytes could fill the memory or keep a core busy for minutes.
+#: Size of a chunk, compressed and decompressed, and size of a message outside chunks [bytes]. Recorders close a chunk
+#: after 1 to 4 MB. Only its last message can make it larger; the largest message is an uncompressed 4K image.
 MAX_CHUNK: Final = 64 << 20
-#: Maximum compression ratio of a chunk. LZ4 reaches at most 255, and nearly constant data 150.
+#: Maximum compression ratio of a chunk. LZ4 reaches a factor of at most 255; for nearly constant data it reaches 150.
 MAX_RATIO: Final = 512
 MAX_RECORD: Final = 8 << 20  #: maximum size of a metadata record, schema or channel [bytes]; Skyloop's have a few kB
 #: Bytes of metadata, schemas and channels, which are kept in memory. In a recording of 100 drones they take about 1 MB.
 MAX_HEAD: Final = 32 << 20
-MAX_PIECES: Final = 500_000  #: maximum number of chunks; at one per second, a recorder writes these in five days
+MAX_PIECES: Final = 500_000  #: maximum number of chunks; a recorder that writes one per second reaches it in five days
 MAX_RECORDS: Final = 5_000_000  #: maximum number of records outside chunks; Skyloop writes a few hundred
-MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
+MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time in the year 2262; later times can't be converted to a date
 _RUN: Final = 4 << 20  #: size of the messages outside chunks to read at once [bytes]
 
 try:
@@ -53,7 +53,7 @@ Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, Ove
 
 Record = Schema | Channel | Message
 
-__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # mcap's, for our other modules
+__all__ = ["Attachment", "Channel", "Message", "Metadata", "Opcode", "Schema"]  # from mcap, for our other modules
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +62,12 @@ class Piece:
 
     offset: int  #: offset of the chunk's data, or of the first record in the run
     size: int  #: size in the file [bytes]
-    start_ns: int = 0  #: log times of its first and last messages; 0 if unknown
+    start_ns: int = 0  #: log times of the first and last messages; 0 if unknown
     end_ns: int = 0
     compression: str | None = None  #: a chunk's compression, ``""`` if it is not compressed; None for a run of messages
-    crc: int | None = 0  #: checksum; 0 if there is none, None if it has not yet been read from the chunk's head
+    crc: int | None = 0  #: checksum; 0 if there is none, None if it has not been read from the chunk's head yet
     unpacked: int = 0  #: uncompressed size of a chunk's records, as announced
-    cut: bool = False  #: whether the file ends within it
+    cut: bool = False  #: whether the file ends within this piece
 
 
 @dataclass(slots=True)
@@ -81,7 +81,7 @@ class Scan:
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each attachment
-    cut: str = ""  #: why the file is incomplete; empty for a file with an index and an end
+    cut: str = ""  #: why the file is incomplete; empty if the file has an index and an end
     damaged: list[str] = field(default_factory=list)  #: descriptions of unreadable parts
     head: int = 0  #: size of the metadata, schemas and channels kept in memory [bytes]
 
@@ -94,7 +94,7 @@ class Scan:
 def scan(path: str | Path) -> Scan:
     """Scan a file once.
 
-    Raise ``UsageError`` if the file does not exist or can't be read, or ``FileFormatError`` if it is not an MCAP file.
+    Raise ``UsageError`` if the file does not exist or can't be read, and ``FileFormatError`` if it is not an MCAP file.
     """
     file_path = Path(path)
     with open_file(file_path) as file:
@@ -105,7 +105,7 @@ def scan(path: str | Path) -> Scan:
 
 
 def find_channels(found: Scan) -> None:
-    """Read all of a truncated file to find its channels: only complete files repeat them at the end."""
+    """Read all of a truncated file to find its channels, because only complete files repeat them at the end."""
     with open_file(found.path) as file:
         for piece in found.pieces:
             for record in records(file, piece, found.damage):
@@ -113,7 +113,7 @@ def find_channels(found: Scan) -> None:
 
 
 def attachments(found: Scan) -> Iterator[Attachment]:
-    """Yield the attachments. Skip unreadable ones and list them as damage."""
+    """Yield the attachments. Skip unreadable attachments and list them as damage."""
     with open_file(found.path) as file:
         for offset, length in found.attachments:
             file.seek(offset)
@@ -132,7 +132,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def note(found: Scan, record: Record) -> None:
-    """Store a schema or channel, unless there are too many already."""
+    """Store a schema or channel, unless there are already too many."""
     if isinstance(record, Channel):
         if record.id in found.channels or has_room(found, len(record.topic) + len(str(record.metadata))):
             found.channels[record.id] = record
@@ -141,7 +141,7 @@ def note(found: Scan, record: Record) -> None:
 
 
 def has_room(found: Scan, size: int) -> bool:
-    """Return whether ``size`` more bytes can be kept in memory; if not, list that as damage."""
+    """Return whether ``size`` more bytes can be kept in memory; if not, list this as damage."""
     found.head += size
     if found.head > MAX_HEAD:
         found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels; the rest are skipped")
@@ -157,7 +157,7 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
             piece = _with_crc(file, piece)
         file.seek(piece.offset)
         data = file.read(piece.size)
-        most = len(data)  # maximum number of records: each takes at least one uncompressed byte
+        most = len(data)  # maximum number of records, since each one takes at least one uncompressed byte
         if piece.compression is not None:
             data = _unpack(piece, data)
         yield from _parse(data, most)
@@ -174,7 +174,7 @@ def chunk_head_size(compression: str) -> int:
 def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
     """Read the checksum of a chunk that is known only from the index.
 
-    Raise ``ValueError`` if there is no chunk at that place.
+    Raise ``ValueError`` if there is no chunk at that offset.
     """
     size = chunk_head_size(piece.compression or "")
     file.seek(piece.offset - size)
@@ -287,9 +287,9 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """Decompress a chunk's records; of a truncated chunk, those that the compression format allows to be recovered.
+    """Decompress a chunk's records; if the chunk is truncated, recover as many as its compression format allows.
 
-    Decompress no more than the chunk announces, and nothing if it announces too much.
+    Decompress at most as much as the chunk announces, and nothing if it announces too much.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
@@ -324,7 +324,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
 
 
 def _parse(data: bytes, most: int) -> Iterator[Record]:
-    """Yield records up to the end of the data, skipping one that is cut off there.
+    """Yield records up to the end of the data; skip a record that is cut off there.
 
     Raise ``ValueError`` if there are more than ``most`` records.
     """
@@ -352,22 +352,22 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
 
 # By the index ---------------------------------------------------------------------------------------------------
 #
-# Opens a file without reading all its records. The index is trusted only if it accounts for every byte of the file, in
-# which case it agrees with scan(). The footer holds the offset and checksum of the summary, which lists each chunk's
-# offset, size and times.
+# Opens a file without reading all of its records. The index is trusted only if it accounts for every byte of the file,
+# in which case it must agree with scan(). The footer holds the offset and checksum of the summary, which lists the
+# offset, size and times of each chunk.
 
 
 _FOOTER: Final = struct.Struct("<QQI")  #: offset of the summary, offset of its offset section, checksum
 _TAIL: Final = FRAME.size + _FOOTER.size + len(MAGIC)
 _DATA_END: Final = FRAME.size + 4
-_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes in the map that follows
-_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, compressed and uncompressed
+_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset, length, bytes in the map that follows
+_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, first compressed, then uncompressed
 _U64: Final = struct.Struct("<Q")
 _U32: Final = struct.Struct("<I")
 
 
 def indexed(path: str | Path) -> Scan | None:
-    """Return the structure of a file from its index, or None if it has no reliable one.
+    """Return the structure of a file from its index, or None if it has no reliable index.
 
     Raise ``UsageError`` if the file does not exist or can't be read.
     """
@@ -388,7 +388,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     if not begin or summary is None:
         return False
     data, end = summary
-    spans: list[tuple[int, int]] = []  # offset and end of each part between the header and the end of the data
+    spans: list[tuple[int, int]] = []  # offset and end of each part between the header and the end of data
     metadata: list[MetadataIndex] = []
     for opcode, body in _records(data):
         if opcode == Opcode.CHUNK_INDEX:
@@ -413,7 +413,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # if content is skipped for its size, the order matters, so a scan is needed
+    return not found.damaged  # oversized content was skipped, but its order matters, so a scan is needed
 
 
 def _header_end(file: IO[bytes]) -> int:
@@ -426,7 +426,7 @@ def _header_end(file: IO[bytes]) -> int:
 
 
 def _summary(found: Scan, file: IO[bytes]) -> tuple[bytes, int] | None:
-    """Return the summary section and the offset where the data before it end; None if it is missing or damaged."""
+    """Return the summary section and the offset of the end of the data before it; None if it is missing or damaged."""
     at = found.size - _TAIL
     if at < 0:
         return None

@@ -1,4 +1,4 @@
-"""Subscribe to drones in order to record or show them: samples go to a backlog, frames through an encoder."""
+"""Subscribe to drones in order to record or show them: samples go to a backlog, frames go through an encoder."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # frames besides one being encoded and one arriving; a client can't hold more frame slots
-_SIZE: Final = 400  #: approximate size of an ordinary sample [bytes]
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # time without a frame of the stream after which decoded frames are recorded
-_PARAMETERS_S: Final = 2.0  # pause before trying again to read parameters
+_FRAMES_WAITING: Final = 2  # frames besides the one being encoded and the one arriving; a client can't hold more slots
+_SIZE: Final = 400  #: approximate size of a typical sample [bytes]
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # after this time without a frame of the stream, decoded frames are recorded
+_PARAMETERS_S: Final = 2.0  # pause before the next attempt to read parameters
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Gaps:
         self._last = None
 
     def follow(self, number: int) -> None:
-        """Add the next number."""
+        """Process the next number."""
         last = self._last
         if last is not None and number > last + 1:
             self.missed += number - last - 1
@@ -117,7 +117,7 @@ class Tap:
             video.start()
 
     def stop(self) -> None:
-        """Unsubscribe. When this returns, everything received is in the backlog."""
+        """Unsubscribe. When this call returns, all received samples are in the backlog."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
@@ -126,7 +126,7 @@ class Tap:
             video.stop()
 
     def dropped(self) -> dict[str, int]:
-        """Return the number of samples received but dropped, by channel."""
+        """Return the number of samples that were received but dropped, by channel."""
         found = {
             channel: count for (number, channel), count in list(self._backlog.dropped.items()) if number == self._number
         }
@@ -136,13 +136,13 @@ class Tap:
         return found
 
     def missed(self) -> dict[str, int]:
-        """Return the number of samples never received, by channel."""
+        """Return the number of samples that were never received, by channel."""
         found = {channel: gap.missed for channel, gap in self._gaps.items()}
         found |= {video.channel: video.missed for video in self._videos}
         return {channel: missed for channel, missed in found.items() if missed}
 
     def check_streams(self) -> None:
-        """Check each second whether the vehicle's own encoding is still arriving."""
+        """Check every second whether the vehicle's own encoding is still arriving."""
         for video in self._videos:
             video.check_stream(time.monotonic_ns())
 
@@ -173,7 +173,7 @@ class Tap:
     def _event(self, event: Event) -> None:
         if event.seq:  # the client's own events have no number
             self._gaps["events"].follow(event.seq)
-        if event.kind is not EventKind.RECORDING:  # put_event adds the recorder's own events
+        if event.kind is not EventKind.RECORDING:  # put_event adds the recorder's own events itself
             self._put("events", Rank.KEPT, event, _SIZE)
 
     def _applied(self, applied: Applied) -> None:
@@ -190,7 +190,7 @@ class Tap:
 
 
 class Stream:
-    """One camera's frames as encoded by the vehicle, or for a subscriber, starting at the first key frame."""
+    """One camera's frames as encoded by the vehicle, or encoded for a subscriber, starting at the first key frame."""
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, subscriber: str = "") -> None:
         self.gaps = Gaps()
@@ -255,12 +255,12 @@ class Video:
 
     @property
     def dropped(self) -> int:
-        """Frames that the encoder skipped or could not encode, or that can't be decoded."""
+        """Number of frames that the encoder skipped or could not encode, or that can't be decoded."""
         return self._buffer.dropped + self._failed + (self._stream.dropped if self._stream is not None else 0)
 
     @property
     def missed(self) -> int:
-        """Frames that never arrived."""
+        """Number of frames that never arrived."""
         return self.gaps.missed + (self._stream.gaps.missed if self._stream is not None else 0)
 
     def start(self) -> None:
@@ -272,7 +272,7 @@ class Video:
             self._listen(True)
 
     def stop(self) -> None:
-        """Unsubscribe and end the encoder's thread."""
+        """Unsubscribe, and end the thread of the encoder."""
         if self._stream is not None:
             self._stream.stop()
         self._listen(False)
@@ -300,7 +300,7 @@ class Video:
 
     def _arrived(self, arrival: Arrival) -> None:
         if self._stream is not None and arrival.received_ns - self._stream.newest_ns < _STREAM_GONE_NS:
-            return  # the stream is back and is recorded instead
+            return  # the stream has returned and is recorded instead
         header = arrival.header
         self.gaps.follow(header.seq)
         if header.encoding is Encoding.JPEG:
@@ -315,7 +315,7 @@ class Video:
             arrival = self._buffer.wait()
             if arrival is not None:
                 self._encode_one(arrival)
-            del arrival  # otherwise its frame slot would stay leased while waiting for the next one
+            del arrival  # otherwise its frame slot would remain leased during the wait for the next frame
 
     def _encode_one(self, arrival: Arrival) -> None:
         try:
@@ -344,7 +344,7 @@ def encoder(options: Options) -> Encode:
         import cv2
     except ImportError as error:
         raise MissingExtraError("recording raw frames", "record", cause=str(error)) from None
-    if options.encoding == "png":  # level 1 is twice as fast as the default and makes files hardly larger
+    if options.encoding == "png":  # level 1 is twice as fast as the default level and makes files hardly larger
         suffix, settings = ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]
     else:
         suffix, settings = ".jpg", [cv2.IMWRITE_JPEG_QUALITY, options.quality]
@@ -384,7 +384,7 @@ class Parameters:
             self._thread.join()
 
     def event(self, event: Event) -> None:
-        """Read the parameters again after one was written or a link was restored."""
+        """Read the parameters again after a parameter was written or a link was restored."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._wake.set()
@@ -399,10 +399,10 @@ class Parameters:
             again = None if self._read_all() else _PARAMETERS_S
 
     def _read_all(self) -> bool:
-        """Read the parameters; return whether that succeeded."""
+        """Read the parameters; return whether this succeeded."""
         try:
             parameters = self._drone.config.parameters()
-        except Exception as error:  # noqa: BLE001  (read again later; if the thread ended, no change would be recorded)
+        except Exception as error:  # noqa: BLE001 (retried later; if the thread ended, no changes would be recorded)
             if not isinstance(error, SkyloopError):
                 _log.exception("the parameters of %s can't be recorded", self._drone.name)
             return False
@@ -416,15 +416,15 @@ class Parameters:
 # A live view -----------------------------------------------------------------------------------------------------
 
 
-BEAT_S: Final = 0.02  #: interval between polls of the backlog; polling spares receiving threads from waking the view
-_BATCH: Final = MB  # number of bytes to show before asking the screen again which sources it needs
+BEAT_S: Final = 0.02  #: interval between polls of the backlog, so that receiving threads need not wake the view
+_BATCH: Final = MB  # number of bytes to show before the screen is asked again which sources it needs
 _LIMIT: Final = 16 * MB  # maximum number of bytes held for a slow screen; older images are useless to a viewer
 _RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
-_LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the streams
+_LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the video streams
 NICENESS: Final = 5
 
-#: A drone's index, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
+#: The index of a drone, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
 Source = tuple[int, str]
 
 
@@ -432,7 +432,7 @@ class Screen(Protocol):
     """Displays samples. All methods except :meth:`close` are called on the view's thread."""
 
     def wanted(self) -> frozenset[Source]:
-        """Return the sources currently on display; only these are subscribed to."""
+        """Return the sources that are currently displayed; only these are subscribed to."""
 
     def show(self, item: Item) -> None: ...
 
@@ -450,7 +450,7 @@ class View:
         """
         check_names(drones, "view")
         self.failed = 0  #: number of samples that could not be shown
-        self.failed_why = ""  #: channel and error of the last such sample
+        self.failed_why = ""  #: channel and error of the last sample that could not be shown
         self._drones = drones
         self._screen = screen
         self._backlog = Backlog(_LIMIT, _RESERVE)
@@ -503,12 +503,12 @@ class View:
             _log.exception("the view continues after an error")
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:
-        """Subscribe to the sources needed and show received samples. Called by the thread, or by a test."""
+        """Subscribe to the sources needed and show received samples. Called by the view's thread, or by a test."""
         self._subscribe(frozenset() if ending else self._screen.wanted())
         for item in self._backlog.take(_BATCH):
             try:
                 self._screen.show(item)
-            except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
+            except Exception as error:  # noqa: BLE001 (samples contain whatever applications send)
                 self.failed += 1
                 self.failed_why = f"{item.channel}: {error!r:.200}"
                 _log.warning("a sample of %s can't be shown: %r", item.channel, error)
@@ -529,6 +529,6 @@ class View:
 
 
 def give_way() -> None:
-    """Lower the priority of this process and of threads that it starts later, so that flying takes precedence."""
+    """Lower the priority of this process and of threads it starts later, so that flying takes precedence."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)

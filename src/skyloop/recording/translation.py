@@ -1,4 +1,4 @@
-"""Translate received samples to messages in a file: Skyloop's own, and others for viewers. Pure."""
+"""Translate received samples to messages in a file: Skyloop's own messages, and other messages for viewers. Pure."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Schema:
 
     @classmethod
     def of(cls, kind: type[Any]) -> Schema:
-        """Return the schema for a :class:`Message`'s kind."""
+        """Return the schema for a kind of :class:`Message`."""
         if issubclass(kind, msgspec.Struct):
             return cls(layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind), layout.JSON)
         return cls(kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind), layout.PROTOBUF)
@@ -75,7 +75,7 @@ class Picture:
 
 
 class Path:
-    """The points of a drone's path, oldest first, thinned out to a limited number."""
+    """The points of a drone's path, oldest first, thinned to a limited number."""
 
     def __init__(self) -> None:
         self.places: list[Any] = []
@@ -83,7 +83,7 @@ class Path:
         self._count = 0
 
     def add(self, place: Any) -> None:
-        """Append a point, or skip it if it is too close to the last one."""
+        """Append a point; skip it if it is too close to the previous point."""
         if self._count % self._step == 0:
             self.places.append(place)
             if len(self.places) > _PLACES:
@@ -184,14 +184,14 @@ class Translator:
         at_ns = self._unix(annotation.captured_ns)
         yield self._own(Channel.ANNOTATIONS, annotation, log_ns, at_ns)
         if annotation.camera not in self._camera_names:
-            return  # an unknown camera: names chosen by applications must not create topics
+            return  # an unknown camera; names chosen by applications must not create topics
         topic = layout.drawing_topic(self._drone, annotation.camera)
         yield Message(topic, foxglove.ImageAnnotations, foxglove.drawing(annotation, at_ns), log_ns, at_ns)
 
     def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(entry.at_ns)
-        # Applications choose an entry's own time, which is kept inside the entry. If it were used as the publish time,
-        # times could run backwards and viewers would re-sort the whole topic.
+        # Applications choose an entry's own time, which is stored inside the entry. If this time were used as the
+        # publish time, times could run backwards and viewers would re-sort the whole topic.
         yield self._own(Channel.LOGS, entry, log_ns, log_ns)
         if entry.name == MOCAP and entry.values is not None and len(entry.values) >= 7:
             pose = foxglove.pose_in_world(at_ns, foxglove.pose_of(entry.values))

@@ -1,4 +1,4 @@
-"""The writing thread and its files: takes samples from the backlog, translates and writes them, watches the disk."""
+"""The writing thread and its files: take samples from the backlog, translate and write them, and watch the disk."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
 from skyloop.recording.translation import Message, Picture, Schema, Translator
 
-CHUNK: Final = MB  #: size at which a chunk is closed, or earlier by :meth:`RecordingFile.commit`
-BEAT_S: Final = 0.05  #: interval between polls of the backlog; polling spares receiving threads from waking the writer
-_COMMIT_NS: Final = nanoseconds(0.5)  #: time within which samples reach the file, unless the disk is too slow
-_REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that was full
-#: How long to keep writing a full file until a key frame arrives: cameras not on drones send one every 10 s or so.
+CHUNK: Final = MB  #: a chunk is closed at this size, or earlier by :meth:`RecordingFile.commit`
+BEAT_S: Final = 0.05  #: interval between polls of the backlog, so that receiving threads need not wake the writer
+_COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
+_REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a disk that had been full
+#: How long to keep writing to a full file until a key frame arrives: cameras not on drones send one about every 10 s.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
-_SILENCE_NS: Final = nanoseconds(2.0)  #: time without H.264 after which a full file does not wait for a key frame
-_LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk, and between attempts to resume writing
+_SILENCE_NS: Final = nanoseconds(2.0)  #: after this time without H.264, a full file does not wait for a key frame
+_LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk space, and between attempts to resume writing
 
 Tell = Callable[[str, Severity], None]
 _log = logging.getLogger(__name__)
@@ -55,16 +55,16 @@ Opener = Callable[[Path, bool], Target]
 
 
 def open_target(path: Path, overwrite: bool) -> Target:
-    """Open a file for unbuffered writing. Raise ``OSError`` if the file already exists, or can't be written."""
+    """Open a file for unbuffered writing. Raise ``OSError`` if the file already exists or can't be written."""
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
 class Output:
-    """The MCAP writer's stream. Nothing reaches the file until :meth:`flush`, which writes everything or nothing."""
+    """The MCAP writer's stream. Nothing is written to the file until :meth:`flush`, which writes all or nothing."""
 
     def __init__(self, target: Target) -> None:
-        self.committed = 0  #: number of bytes in the file, which end at a record boundary
-        self.waiting = 0  #: number of bytes not yet in the file
+        self.committed = 0  #: number of bytes in the file; they end at a record boundary
+        self.waiting = 0  #: number of bytes that are not in the file yet
         self._target = target
         self._pieces: list[bytes] = []
 
@@ -81,7 +81,7 @@ class Output:
     def flush(self) -> None:
         """Write the waiting data to the file.
 
-        Raise ``OSError`` if the disk fails; the file still ends where it did before.
+        Raise ``OSError`` if the disk fails; the end of the file is then unchanged.
         """
         try:
             for piece in self._pieces:
@@ -99,7 +99,7 @@ class Output:
 
 
 class RecordingFile:
-    """An MCAP file being written; :meth:`commit` makes the messages part of the file.
+    """An MCAP file that is being written; :meth:`commit` makes the messages part of the file.
 
     Every method raises ``OSError`` if the disk fails; after that, only :meth:`abandon` may be called.
     """
@@ -139,7 +139,7 @@ class RecordingFile:
 
     @property
     def lost(self) -> bool:
-        """Whether the file was deleted. A file that was only moved is still written to."""
+        """Whether the file has been deleted. A file that was only moved is still written to."""
         try:
             return os.fstat(self._target.fileno()).st_nlink == 0
         except OSError:
@@ -168,7 +168,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Close the file, which is readable up to the last commit but has no summary, and remove it if it is empty."""
+        """Close the file, and remove it if it is empty. It is readable up to the last commit but has no summary."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)
@@ -193,7 +193,7 @@ def free_space(folder: Path) -> int:
 
 
 class FileWriter:
-    """Writes a backlog to one file or several in turn. Public attributes can be read from any thread."""
+    """Writes a backlog to one file, or to several files in turn. Public attributes can be read from any thread."""
 
     def __init__(
         self,
@@ -210,15 +210,15 @@ class FileWriter:
     ) -> None:
         """Initialise without opening a file. ``tell`` is called on the writing thread or, at first, :meth:`start`'s."""
         self.state = RecorderState.STARTING  #: state of the recorder
-        self.reason = ""  #: why the recorder is paused or has failed
+        self.reason = ""  #: reason why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
-        self.room = Room.ALL  #: which samples to write, given the space left on the disk
+        self.room = Room.ALL  #: which samples to write, depending on the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
-        self.unwritable_why = ""  #: channel and error of the last such sample
-        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals for the end of each file
+        self.unwritable_why = ""  #: channel and error of the last sample that could not be written
+        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals at the end of each file
         #: function that returns the totals of missed samples by drone and channel, for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
-        self.each_second: Callable[[], None] = lambda: None  #: called each second on the writing thread
+        self.each_second: Callable[[], None] = lambda: None  #: called every second on the writing thread
         self._path = path
         self._options = options
         self._backlog = backlog
@@ -237,7 +237,7 @@ class FileWriter:
         self._now_ns = clock.monotonic_ns
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
         self._due_ns = 0  # time at which a new file became due
-        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 in this file, by drone and channel
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 chains in this file, by drone and channel
         self._encoded_ns = 0  # time of the last H.264 frame written
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
@@ -245,7 +245,7 @@ class FileWriter:
     def start(self) -> None:
         """Open the first file and start the thread.
 
-        Raise ``UsageError`` if the file can't be written, or the disk is too full.
+        Raise ``UsageError`` if the file can't be written or the disk is too full.
         """
         folder = self._path.parent
         try:
@@ -269,13 +269,13 @@ class FileWriter:
 
     @property
     def shown_reason(self) -> str:
-        """Why it is paused, has failed or is leaving frames out."""
+        """The reason why recording is paused, has failed or is leaving out frames."""
         short = self.state is RecorderState.RECORDING and self.room is Room.NO_FRAMES
         return "the disk is nearly full: no frames are recorded" if short else self.reason
 
     @property
     def path(self) -> Path:
-        """The current file or, if there is none, the last one."""
+        """The current file or, if there is none, the previous one."""
         return self.files[-1] if self.files else self._path
 
     @property
@@ -295,18 +295,18 @@ class FileWriter:
     def _run(self) -> None:
         try:
             self._work()
-        except Exception as error:  # noqa: BLE001  (the state must never claim that this is still recording)
+        except Exception as error:  # noqa: BLE001 (the state must never claim that recording continues)
             self._fail(error)
 
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # so that it tries once more if paused, and writes the final counts
+        self._look_due_ns = 0  # makes a paused recording try once more, and writes the final counts
         self.step(time.monotonic_ns())
         self._end()
 
     def _fail(self, error: Exception) -> None:
-        """Stop after an unexpected error: set the state, report the error and keep the committed data."""
+        """Stop after an unexpected error: set the state, report the error and preserve the committed data."""
         self.state, self.reason = RecorderState.FAILED, f"an error in the recorder: {error!r:.300}"
         _log.exception("the recording to %s ends", self.path)
         file, self._file = self._file, None
@@ -319,7 +319,7 @@ class FileWriter:
             self._report(text, Severity.ERROR)
 
     def step(self, now_ns: int) -> None:
-        """Do the work that is due at a time [ns, monotonic]. Called by the thread, or by a test."""
+        """Do the work that is due at the given time [ns, monotonic]. Called by the writing thread, or by a test."""
         self._now_ns = now_ns
         try:
             if now_ns >= self._look_due_ns:
@@ -333,7 +333,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate and write all waiting samples, committing along the way."""
+        """Translate and write all waiting samples, committing data along the way."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
@@ -353,7 +353,7 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # done before writing, so that nothing is lost if the disk fails in the middle
+        self._uncommitted += batch  # done before writing, so that nothing is lost if the disk fails midway
         for item in batch:
             for message in self._messages(item):
                 file.write(message)
@@ -364,7 +364,7 @@ class FileWriter:
         """Return all of a sample's messages, or none if the sample can't be translated."""
         try:
             return list(self._translators[item.drone].messages(item))
-        except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
+        except Exception as error:  # noqa: BLE001 (samples contain whatever applications send)
             self._backlog.count(item)
             self.unwritable += 1
             self.unwritable_why = f"{item.channel}: {error!r:.200}"
@@ -403,7 +403,7 @@ class FileWriter:
         )
 
     def _rotate_when_due(self) -> None:
-        """Start a new file when due. With H.264, :meth:`_write` does so at a key frame, unless none arrives."""
+        """Start a new file when one is due. With H.264, :meth:`_write` does so at a key frame, unless none arrives."""
         if not self._rotation_due():
             return
         self._due_ns = self._due_ns or self._now_ns
@@ -419,7 +419,7 @@ class FileWriter:
 
     def _open(self) -> None:
         number = len(self.files) + 1
-        # The user did not choose the name of the file that follows a pause, so it must not overwrite anything.
+        # The user did not choose the name of a file that follows a pause, so this file must not overwrite anything.
         overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
         first = number == 1 and not self._options.rotates
         path = self._path if first else self._next_free(number, overwrite)
@@ -462,7 +462,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """Pause because writing to the disk failed. Samples not yet committed wait for the next file."""
+        """Pause because writing to the disk failed. Samples that are not committed yet wait for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
@@ -514,6 +514,6 @@ def _is_key(item: Item) -> bool:
 
 
 def _why(error: OSError) -> str:
-    """Describe an error in words that users understand."""
+    """Describe an error in words that users can understand."""
     place = f": {error.filename}" if error.filename else ""
     return f"{error.strerror or error}{place}"

@@ -21,26 +21,26 @@ from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_m
 PURPOSE: Final = "the bridge to ROS 2"
 MESSAGES: Final = ("sensor_msgs.msg", "geometry_msgs.msg", "nav_msgs.srv", "std_srvs.srv", "std_msgs.msg")
 UPDATE_S: Final = 0.2  #: interval between checks for subscribers to images
-_WAITING: Final = 4  #: number of a drone's services that may wait at the same time
+_WAITING: Final = 4  #: maximum number of a drone's services that may wait at the same time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Options of a bridge.
 
-    Raise ``UsageError`` if a value is out of range, or two drones have the same name in ROS 2.
+    Raise ``UsageError`` if a value is out of range, or if two drones have the same name in ROS 2.
     """
 
     drones: tuple[str, ...]  #: names of running proxies; each becomes a namespace
-    #: request control authority immediately with this priority, 0 (highest) to 31, and use the same priority in the
-    #: service. None: only the service requests it, with the default priority.
+    #: if set, request control authority immediately with this priority, 0 (highest) to 31; the service uses it too. If
+    #: None, only the service requests it, with the default priority.
     priority: int | None = None
     #: the drone hovers if no cmd_vel arrives for this long; must be greater than 0 and at most 5 s
     timeout_s: float = 0.5
-    #: a common frame for all drones' ``odom``, if a single simulator or motion capture system locates them; empty: none
+    #: a common frame for all drones' ``odom``, if a single simulator or motion capture system locates them; else empty
     map_frame: str = ""
-    use_sim_time: bool = False  #: use the time from ``/clock`` for stamps
-    domain: int | None = None  #: DDS domain; None: taken from ``ROS_DOMAIN_ID``
+    use_sim_time: bool = False  #: whether to use the time from ``/clock`` for stamps
+    domain: int | None = None  #: DDS domain; if None, the domain is taken from ``ROS_DOMAIN_ID``
     #: make the nodes visible to other machines, not only this one, unless the environment configures it
     subnet: bool = False
     arguments: tuple[str, ...] = ()  #: arguments for ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``
@@ -56,12 +56,12 @@ class Settings:
 
 
 class Bridge:
-    """Connects drones to ROS 2 within a ``with`` block. On exit, it lands the drones that it flies.
+    """Connects drones to ROS 2 within a ``with`` block. On exit, it lands the drones that it is flying.
 
     Raises on entering:
         MissingExtraError: rclpy or a message package is not installed.
-        UsageError: ROS 2 refuses its arguments.
-        SkyloopError: Connecting to a drone failed or, with ``priority``, the authority was refused.
+        UsageError: ROS 2 rejects its arguments.
+        SkyloopError: Connecting to a drone failed or, with ``priority``, the request for authority was refused.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -106,9 +106,9 @@ class Bridge:
                 return
 
     def _add(self, context: RosContext, drone: Drone, namespace: str) -> tuple[Any, Any]:
-        """Set up a drone; return two nodes: one whose callbacks may block and one whose callbacks never do."""
+        """Set up a drone; return two nodes: the callbacks of one may block, and the callbacks of the other never do."""
         settings = self._settings
-        # Nodes must not publish the type that the transforms borrow and rename (skyloop.ros.names).
+        # Nodes must not publish the message type that the transforms borrow and rename (skyloop.ros.names).
         own = {"use_sim_time": settings.use_sim_time, "start_type_description_service": False}
         node = context.node("skyloop", namespace, own)
         topics = context.node("skyloop_commands", namespace, own)
@@ -118,7 +118,7 @@ class Bridge:
         Telemetry(node, drone, time, frames)
         self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
         pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
-        self._stack.callback(pilot.close)  # close the pilot before disconnecting from the drone, which lands it
+        self._stack.callback(pilot.close)  # close the pilot before disconnecting, because disconnecting lands the drone
         if settings.priority is not None:
             pilot.request_authority()
         return node, topics

@@ -3,8 +3,8 @@
 rclpy lacks ``tf2_msgs/msg/TFMessage`` if that message's package is not installed, so the publisher sends ready-made
 bytes. rclpy gets a *type support* from a message's class: a C structure with the message's name, the hash of its
 definition, and functions that serialise it (``rosidl_message_type_support_t`` and, for Fast DDS,
-``message_type_support_callbacks_t``). A publisher of bytes calls only the one that returns the largest size, which is
-unknown with unbounded members. The functions of another such message therefore work with this one's name and hash.
+``message_type_support_callbacks_t``). A publisher of bytes calls only the function that returns the largest size, which
+is unknown for unbounded members. Another such message's functions therefore work with the name and hash of this one.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of a drone's frames; each begins with the drone's name, because several drones share one tree."""
+    """Names of a drone's frames. Each one begins with the drone's name, because several drones share one tree."""
 
     drone: str  #: the drone's name, as a valid ROS 2 name
-    map: str = ""  #: the frame in which all drones' ``odom`` have the same origin; empty: none
+    map: str = ""  #: the frame in which the ``odom`` frames of all drones have the same origin; empty for none
 
     @property
     def odom(self) -> str:
-        """The drone's world axes, x east, y north, z up: continuous, but may drift."""
+        """The drone's world axes, x east, y north, z up; the frame is continuous, but may drift."""
         return f"{self.drone}/odom"
 
     @property
     def base(self) -> str:
-        """The drone's body axes, x forward, y left, z up."""
+        """The drone's body axes: x forward, y left, z up."""
         return f"{self.drone}/base_link"
 
     def optical(self, camera: str) -> str:
@@ -79,7 +79,7 @@ class RosTime:
             return self._map.to_ros(captured_ns, self._drone.now_ns, self._clock.now().nanoseconds)
 
     def age_s(self, stamp_ns: int) -> float:
-        """Return the age of a stamp according to the node's clock [s]."""
+        """Return a stamp's age according to the node's clock [s]."""
         return float(self._clock.now().nanoseconds - stamp_ns) / 1e9
 
 
@@ -112,7 +112,7 @@ class _Callbacks(ctypes.Structure):
 
 _Find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 _Hash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-_kept: list[Any] = []  # memory that rclpy keeps pointers to for the lifetime of this process
+_kept: list[Any] = []  # memory to which rclpy keeps pointers for the lifetime of this process
 
 
 def tf_message_type() -> type:
@@ -172,9 +172,9 @@ def _borrowed() -> type:
 
 
 def forget_error() -> None:
-    """Clear the error that ROS 2 stored on this thread when it looked for functions that the type lacks.
+    """Clear the error that ROS 2 stored on this thread when it looked for functions missing from the type.
 
-    Otherwise ROS 2 prints it together with the next error.
+    Otherwise, ROS 2 prints this error together with the next one.
     """
     for line in Path("/proc/self/maps").read_text().splitlines():
         if "/librcutils.so" in line:

@@ -14,7 +14,7 @@ from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
-NEAR_M: Final = 0.2  #: tolerance for a goal that does not specify one
+NEAR_M: Final = 0.2  #: tolerance for a goal that specifies none
 WARN_AGAIN_S: Final = 5.0  #: interval between warnings of the same kind
 
 
@@ -22,10 +22,10 @@ class Pilot:
     """Converts messages on topics and service calls to commands. Commands require control authority.
 
     Args:
-        topics: The rclpy node whose callbacks never wait, in the drone's namespace.
-        services: The node whose callbacks may wait, several at a time.
-        drone: The drone, connected as a pilot, with the time after which a velocity becomes a hover.
-        time: Provides the stamps.
+        topics: The rclpy node in the drone's namespace whose callbacks never wait.
+        services: The node whose callbacks may block, several at a time.
+        drone: The drone, connected as a pilot, with the time limit after which a velocity becomes a hover.
+        time: The source of the stamps.
         frames: Names of the drone's frames.
         priority: Priority for requesting authority, 0 (highest) to 31; None uses the default.
         timeout_s: Maximum age of a stamped velocity [s].
@@ -56,13 +56,13 @@ class Pilot:
         self._log = topics.get_logger()
         self._lock = threading.Lock()
         self._under_way: list[str] = []  # services that are waiting for the drone
-        # Accept reliable and best-effort publishers alike, and keep only the newest sample.
+        # Accept both reliable and best-effort publishers, and keep only the newest sample.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
         topics.create_subscription(PoseStamped, "goal_pose", self.on_goal, newest)
         group = ReentrantCallbackGroup()
-        # These never wait, and must not be queued behind services that do.
+        # These services never wait, and must not be queued behind services that do.
         topics.create_service(Trigger, "hover", self._trigger("hover", drone.hover))
         topics.create_service(Trigger, "emergency_stop", self._trigger("emergency_stop", drone.emergency_stop))
         actions: dict[str, Callable[[], object]] = {
@@ -84,7 +84,7 @@ class Pilot:
         self._drone.request_authority(self._priority)
 
     def close(self) -> None:
-        """Ignore further messages on topics, so that they can't abort the final landing."""
+        """Ignore further messages on topics, because they could abort the final landing."""
         with self._lock:
             self._under_way.append("the end of the bridge")
 
@@ -97,7 +97,7 @@ class Pilot:
         self._unless_occupied("cmd_vel", lambda: self._drone.velocity(**rates))
 
     def on_stamped_velocity(self, message: Any) -> None:
-        """Fly at the velocity in a ``TwistStamped``, unless it is too old or in another frame."""
+        """Fly at the velocity in a ``TwistStamped``, unless the message is too old or in another frame."""
         frame = message.header.frame_id
         stamp_ns = nanoseconds_of(message.header.stamp)
         age_s = self._time.age_s(stamp_ns) if stamp_ns else 0.0
@@ -119,10 +119,10 @@ class Pilot:
         self._unless_occupied("goal_pose", fly)
 
     def _unless_occupied(self, topic: str, send: Callable[[], object]) -> None:
-        """Send a set-point, unless a service is running: programs keep publishing while they wait for one.
+        """Send a set-point unless a service is running, because programs keep publishing while they wait for a service.
 
-        A service takes the same lock before it begins; otherwise a velocity checked before a landing could be sent
-        after it. ``send`` does not wait.
+        A service takes the same lock before it begins; otherwise a velocity that was checked before a landing could be
+        sent after it. ``send`` must not block.
         """
         try:
             with self._lock:
@@ -151,9 +151,9 @@ class Pilot:
     def _place(self, pose: Any) -> dict[str, float]:
         """Return the arguments of ``go_to`` for a ``PoseStamped``.
 
-        A pose drawn in a plane has no height, so z = 0 keeps the current height. A missing orientation keeps the
-        current heading. Raise ``UsageError`` if the pose is in another frame, its numbers are not finite, or its height
-        is unknown.
+        A pose drawn in a plane has no height, so with z = 0 the drone keeps its current height. If the orientation is
+        missing, the current heading is kept. Raise ``UsageError`` if the pose is in another frame, its numbers are not
+        finite, or its height is unknown.
         """
         frame, place, turn = pose.header.frame_id, pose.pose.position, pose.pose.orientation
         allowed = [each for each in ("odom", self._frames.odom, self._frames.map) if each]
@@ -168,7 +168,7 @@ class Pilot:
                 raise UsageError("the goal's height is 0 and the drone's own is unknown: give z")
             found["z"] = position[2]
         angles = euler_of((turn.x, turn.y, turn.z, turn.w))
-        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # the default of a new message
+        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # default of a new message
         if angles is not None and not as_made:
             found["yaw"] = angles[2]
         return found
@@ -191,7 +191,7 @@ class Pilot:
         return call
 
     def _go_to(self, request: Any, response: Any) -> Any:
-        """Fly to ``goal`` and wait. The plan is the straight path that was flown, or empty if there was none."""
+        """Fly to ``goal`` and wait. The plan is the straight path that was flown, or empty if nothing was flown."""
         from geometry_msgs.msg import PoseStamped
 
         try:
@@ -212,7 +212,7 @@ class Pilot:
 
 
 def _in_words_of_ros(error: SkyloopError) -> str:
-    """Return the reason, with the equivalent services instead of Python calls."""
+    """Return the reason, with Python calls replaced by the equivalent services."""
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
@@ -239,7 +239,7 @@ class Parameters:
         for each in parameters:
             known = self._known.get(each.name)
             if known is None or _same(known.value, each.value):
-                continue  # the node's own parameter, or already set
+                continue  # either the node's own parameter, or already set
             try:
                 self._drone.config[each.name] = each.value
                 self._known[each.name] = self._drone.config.describe(each.name)

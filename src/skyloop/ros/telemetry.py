@@ -26,7 +26,7 @@ from skyloop.vehicles.ros2.wire import (
     stamp_of,
 )
 
-SLOW_NS: Final = 1_000_000_000  #: interval between battery states and between geographic positions
+SLOW_NS: Final = 1_000_000_000  #: interval between battery messages, and between geographic positions
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 JPEG_QUALITY: Final = 90
 
@@ -158,7 +158,7 @@ class Telemetry:
         return message
 
     def _twist(self, feedback: Feedback) -> Any:
-        """Return velocity and rates in body axes; None if velocity or tilt is unknown."""
+        """Return velocity and rates in body axes, or None if the velocity or tilt is unknown."""
         from geometry_msgs.msg import Twist
 
         if feedback.velocity_m_s is None or feedback.roll_rad is None or feedback.pitch_rad is None:
@@ -193,7 +193,7 @@ class Telemetry:
             return None
         message = BatteryState(
             voltage=_or_nan(feedback.battery_v),
-            percentage=_or_nan(feedback.battery),  # 0 to 1, as everywhere in Skyloop
+            percentage=_or_nan(feedback.battery),  # fraction from 0 to 1, as everywhere in Skyloop
             present=True,
             power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
             **dict.fromkeys(("temperature", "current", "charge", "capacity", "design_capacity"), math.nan),
@@ -238,7 +238,7 @@ def _or_nan(value: float | None) -> float:
 
 
 class CameraPublisher:
-    """Publishes one camera while there are subscribers; otherwise frames are not requested."""
+    """Publishes the images of one camera while there are subscribers; otherwise frames are not requested."""
 
     def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
         from rclpy.qos import qos_profile_sensor_data
@@ -266,7 +266,7 @@ class CameraPublisher:
 
     @property
     def watched(self) -> bool:
-        """Whether any of the topics has subscribers."""
+        """Whether any of the topics has a subscriber."""
         publishers = (self._image, self._info, self._compressed)
         return any(each is not None and each.get_subscription_count() for each in publishers)
 
@@ -308,7 +308,7 @@ class CameraPublisher:
         from sensor_msgs.msg import CompressedImage
 
         message = self._head(CompressedImage(), stamp_ns)
-        message.format = "bgr8; jpeg compressed bgr8"  # the format string of image_transport's publisher
+        message.format = "bgr8; jpeg compressed bgr8"  # the format string that the publisher of image_transport uses
         _, encoded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         message.data = array("B", encoded.tobytes())
         return message

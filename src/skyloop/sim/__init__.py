@@ -1,4 +1,4 @@
-"""The simulator: worlds loaded from text files and quadrotors with the logic of real firmware, stepped by their owner.
+"""The simulator: worlds loaded from text files, and quadrotors with the logic of real firmware; its owner steps it.
 
 It is independent of proxies and networks. Only :class:`Pacer` reads a wall clock.
 """

@@ -1,7 +1,7 @@
 """The drones' flight logic, which applies commands, follows a table of states and controls the loops' set-points.
 
-A :class:`Happening` changes a state. If :data:`TRANSITIONS` does not list it for the current state, it is ignored, as
-in firmware. Some happenings depend on the charge of the :class:`Batteries`.
+Each :class:`Happening` changes a state. An event that :data:`TRANSITIONS` does not list for the current state is
+ignored, as in firmware. Some events depend on the charge of the :class:`Batteries`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from skyloop.sim.streams import Floats
 
 
 class Happening(Enum):
-    """Causes of state changes: first the pilot's commands, then the vehicle's own observations."""
+    """Causes of state changes: first the pilot's commands, then what the vehicle itself observes."""
 
     TAKEOFF = auto()
     LAND = auto()
@@ -86,7 +86,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """Return the next state, or None if the happening is ignored."""
+    """Return the next state, or None if the event is ignored."""
     return TRANSITIONS[state].get(happening)
 
 
@@ -113,19 +113,19 @@ class Batteries:
         return share
 
     def open_voltage(self) -> Floats:
-        """Return the voltage without a load, (n,) [V]."""
+        """Return the open-circuit voltage, (n,) [V]."""
         voltage: Floats = self._empty + (self._full - self._empty) * self.charge
         return voltage
 
 
-LOW_BATTERY = 0.03  # charge below which the vehicle lands, 0 to 1
-_HEIGHT_TOLERANCE_M = 0.08  # distance below its target height at which a take-off counts as finished
-_STANDING_S = 0.05  # maximum time since the last ground contact for a drone to count as standing
+LOW_BATTERY = 0.03  # charge below which the vehicle lands, as a fraction from 0 to 1
+_HEIGHT_TOLERANCE_M = 0.08  # a take-off counts as finished at this distance below its target height
+_STANDING_S = 0.05  # a drone whose last ground contact is no longer ago than this counts as standing
 _KEPT_OCCURRENCES = 1000
 
 
 class Autopilot:
-    """Flight states and set-points of all drones. Times are simulation times."""
+    """Flight states and set-points of all drones. Times are in simulation time."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class Autopilot:
         self.states = [FlightState.LANDED for _ in parameters]
         self.reasons = ["" for _ in parameters]
         self.occurrences: deque[Occurrence] = deque(maxlen=_KEPT_OCCURRENCES)
-        self._stood_s = [0.0 for _ in parameters]  # time when each drone was last supported from below
+        self._stood_s = [0.0 for _ in parameters]  # time at which each drone was last supported from below
         self._rising: dict[int, float] = {}  # drones that are taking off, with the altitude at which the take-off ends
         self._warned: set[int] = set()
         self.handed_over: set[int] = set()  #: numbers of drones flown by firmware
@@ -151,8 +151,8 @@ class Autopilot:
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point in force is only clamped when it is sent again. The limits on tilt, climb and altitude that the
-        control loops enforce change immediately.
+        A set-point already in force is not clamped until it is sent again. Changes to the limits on tilt, climb and
+        altitude, which the control loops enforce, take effect immediately.
         """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
@@ -181,7 +181,7 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Make a flying drone hover at its new position, with its estimate of the wind reset."""
+        """Make a flying drone hover at its new position, and reset its estimate of the wind."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
@@ -198,7 +198,7 @@ class Autopilot:
         self.handed_over.add(drone)
 
     def take_back(self, drone: int, time_s: float) -> None:
-        """Take back a drone whose rotors have been stopped."""
+        """Take back control of a drone whose rotors have been stopped."""
         self.handed_over.discard(drone)
         flew, self.states[drone] = self.states[drone].airborne, FlightState.LANDED
         if flew:
@@ -211,16 +211,16 @@ class Autopilot:
             self.states[drone] = FlightState.LANDED if stands else FlightState.FLYING
 
     def supervise(self, time_s: float) -> None:
-        """End the take-off of drones that have reached their target height. Called once per period of the loops."""
+        """End the take-off of each drone that has reached its target height. Called once per period of the loops."""
         for drone, height in list(self._rising.items()):
             if self._sensors.altitude[drone] >= height - _HEIGHT_TOLERANCE_M:
                 self._advance(drone, Happening.HEIGHT_REACHED, Hover(), time_s)
 
     def watch_batteries(self, time_s: float) -> None:
-        """Land drones whose battery is low and stop those whose battery is empty. Called periodically."""
+        """Land drones whose battery is low, and stop drones whose battery is empty. Called periodically."""
         self._loops.set_strength(self._batteries.strength())
         low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
-        self._warned.intersection_update(low)  # warn again after a battery change
+        self._warned.intersection_update(low)  # warn again once the battery has been changed
         for drone in low:
             if drone not in self._warned:
                 self._warned.add(drone)
@@ -232,7 +232,7 @@ class Autopilot:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
     def feel(self, contacts: Contacts, time_s: float) -> None:
-        """Handle the contacts in a step."""
+        """Handle the contacts that occurred in a step."""
         for drone, speed, what in contacts.impacts:
             text = f"hit {what} at {speed:.1f} m/s"
             self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)

@@ -20,16 +20,16 @@ Vec3 = tuple[float, float, float]
 Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
 
-_BLOCK: Final = 16384  #: number of points to undistort at a time
+_BLOCK: Final = 16384  #: number of points that are undistorted at a time
 
-#: Rotation "body from optical" of a level camera that looks forward, with the image's top up.
+#: Rotation "body from optical" of a level camera that faces forward, with the top of its image up.
 LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-#: Rotation "body from optical" of a camera that looks straight down, with the image's top forward.
+#: Rotation "body from optical" of a camera that looks straight down, with the top of its image forward.
 LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 def looking_up(tilt_rad: float) -> Rotation9:
-    """Return "body from optical" for a camera that looks forward, tilted up by an angle, with the image's top up."""
+    """Return "body from optical" for a camera that looks forward, tilted up by an angle, with its image's top up."""
     s, c = math.sin(tilt_rad), math.cos(tilt_rad)
     return (0.0, s, c, -1.0, 0.0, 0.0, 0.0, -c, s)
 
@@ -48,7 +48,7 @@ class CameraPose:
 
     position_m: NDArray[np.float64]  #: position of the optical centre, shape (3,)
     rotation: NDArray[np.float64]  #: rotation from optical to world axes, shape (3, 3)
-    #: number of the drone that carries the camera and is not rendered itself; None for a free camera
+    #: number of the drone that carries the camera and is therefore not rendered; None for a free camera
     drone: int | None = None
 
 
@@ -70,7 +70,7 @@ class CameraModel:
     latency_s: float = 0.0  #: time from the middle of the exposure until the frame is delivered
     noise_sigma: float = 0.0  #: standard deviation of each pixel's channels, on the scale of 0 … 255
     exposure_s: float = 0.0  #: opening time of the shutter, which blurs the image of a turning drone
-    exposure_gain: float = 1.0  #: brightness relative to the scene's own
+    exposure_gain: float = 1.0  #: brightness of the image relative to that of the scene
     vignetting: float = 0.0  #: fraction of the light lost in the corners, 0 … 1
 
     def __post_init__(self) -> None:
@@ -91,7 +91,7 @@ class CameraModel:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The camera matrix K, shape (3, 3)."""
+        """The camera matrix K with shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -105,7 +105,7 @@ class CameraModel:
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """Return the intrinsics, as given with each frame."""
+        """Return the intrinsics that accompany each frame."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 
@@ -149,7 +149,7 @@ class CameraModel:
         return bent * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return x/z and y/z in optical axes for pixels, both of shape (n, 2).
+        """Return x/z and y/z in optical axes for the given pixels; both arrays have shape (n, 2).
 
         Raises:
             UsageError: The distortion folds the image over itself.
@@ -207,7 +207,7 @@ def _undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[n
 
 
 # 320×240 images with Parrot's diagonal fields of view for its AR.Drone: 92° forward and 64° down.
-# The forward lens is a wide one: with this barrel distortion its focal length matches published calibrations.
+# The forward lens is wide-angle: with this barrel distortion, its focal length matches published calibrations.
 FRONT_CAMERA = CameraModel(
     name="front",
     width=320,
@@ -241,7 +241,7 @@ BOTTOM_CAMERA = CameraModel(
     exposure_s=0.006,
     vignetting=0.15,
 )
-# A racing pilot's view: 100° by 76° (120° diagonally), like that of a wide 2.1 mm lens, tilted for fast flight. Rate,
+# A racing pilot's view: 100° by 76° (120° diagonally), as with a wide 2.1 mm lens, tilted for fast flight. Rate,
 # latency and short exposure are estimates for an analogue camera.
 FPV_CAMERA = CameraModel(
     name="fpv",

@@ -20,13 +20,13 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Ratio of rendered to used frames if fewer are used than the camera takes: a consumer that selects frames by its own
-#: count then always finds one in time.
+#: Ratio of rendered to used frames if fewer frames are used than the camera takes. A consumer that selects frames by
+#: its own count then always finds one in time.
 RATE_MARGIN: Final = 1.25
 
 
 class Screen(Protocol):
-    """Receives a drone's frames."""
+    """Receives the frames of a drone."""
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
 
@@ -42,7 +42,7 @@ class Shutter:
         self.count = 0  #: number of exposures so far, including those without an observer
 
     def due(self, now_s: float, fps: float) -> bool:
-        """Return whether an exposure is due. Exposures missed during a pause are not made up for."""
+        """Return whether an exposure is due. Exposures that were missed during a pause are not made up for."""
         if now_s < self._next_s:
             return False
         self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
@@ -59,7 +59,7 @@ class Camera:
     screen: Screen
     seed: int
     shutter: Shutter
-    dropped: int = 0  #: number of exposures replaced by newer ones before rendering
+    dropped: int = 0  #: number of exposures superseded by newer ones before they were rendered
     gone: bool = False  #: whether the camera's observer was detached
     _effects: tuple[CameraModel, SensorEffects] | None = field(default=None, init=False)
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
@@ -97,7 +97,7 @@ class Pipeline(ABC):
     """Renders exposures and delivers each frame when it is due."""
 
     def __init__(self) -> None:
-        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
+        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap ordered by due time
         self._order = itertools.count()
         self._handing = threading.RLock()
 
@@ -107,10 +107,10 @@ class Pipeline(ABC):
 
     @abstractmethod
     def stop(self) -> None:
-        """End. Undelivered frames are lost."""
+        """End. Frames that have not been delivered are lost."""
 
     def hand_out(self, now_ns: int) -> None:
-        """Deliver the frames that are due by now."""
+        """Deliver the frames that are due now."""
         while self._finished and self._finished[0][0] <= now_ns:
             _, _, exposure, picture = heapq.heappop(self._finished)
             with self._handing:
@@ -118,7 +118,7 @@ class Pipeline(ABC):
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames from these cameras. After this returns, no other thread delivers frames."""
+        """Stop delivering frames from these cameras. Once this has returned, no other thread delivers frames."""
         with self._handing:
             for camera in cameras:
                 camera.gone = True
@@ -132,7 +132,7 @@ class Pipeline(ABC):
 class CameraPipeline(Pipeline):
     """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
-    Creating the scene takes a few tenths of a second, so start the pipeline when the first frame is requested.
+    Creating the scene takes a few tenths of a second, so the pipeline is started when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -142,12 +142,12 @@ class CameraPipeline(Pipeline):
         self._drones = drones
         self._quality = quality
         self._changed = threading.Condition()
-        self._waiting: dict[Camera, Exposure] = {}  # the camera that has waited longest comes first
+        self._waiting: dict[Camera, Exposure] = {}  # the camera that has waited longest is first
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
 
     def start(self) -> None:
-        """Start the thread. It first creates the scene, during which newer exposures replace older ones."""
+        """Start the thread. The thread first creates the scene; meanwhile newer exposures replace older ones."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -183,7 +183,7 @@ class CameraPipeline(Pipeline):
                 exposure.camera.screen.failed(error)
 
     def _next(self) -> Exposure | None:
-        """Return the next exposure to render, delivering due frames while waiting; None to stop."""
+        """Return the next exposure to render, delivering due frames while waiting; None means stop."""
         while True:
             self.hand_out(monotonic_ns())
             with self._changed:
@@ -201,7 +201,7 @@ class CameraPipeline(Pipeline):
 class SteppedCameraPipeline(Pipeline):
     """Renders each exposure immediately and delivers due frames on request, all on one thread.
 
-    Intended for a world whose time advances only in explicit steps.
+    Intended for a world whose time advances in explicit steps only.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -227,7 +227,7 @@ def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
 def expose(
     camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
-    """Return the exposure of a camera to a state. The frame is due after the camera's latency."""
+    """Return a camera's exposure for a state. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone
     pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
     due_ns = captured_ns + nanoseconds(model.latency_s / speed)

@@ -1,7 +1,7 @@
 """Collisions of drones with the floor, solids and each other: contact, bounce and friction.
 
 Every few steps, a broad phase finds everything within each drone's reach until the next broad phase. The steps in
-between check only those pairs, as arrays if there are many and one at a time if there are few.
+between check only those pairs: as arrays if there are many drones, and one at a time if there are few.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce; otherwise nothing would come to rest
+_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce; without it, nothing would come to rest
 _PASSES = 6  # number of attempts per step to push a drone out of solids
-_TOUCH_M = 1e-9  # maximum overlap that counts as touching, because rounding leaves some that pushing can't remove
-#: Number of steps between broad phases. With few drones, each costs as much but leaves fewer pairs to check.
+_TOUCH_M = 1e-9  # maximum overlap that is treated as touching, because rounding leaves small overlaps
+#: Number of steps between broad phases. With few drones, a broad phase costs as much but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
-_SLACK_M = 0.03  # extra reach in a broad phase, to allow for drones being pushed
-#: Maximum number of pairs that are faster to check one at a time.
+_SLACK_M = 0.03  # extra reach in a broad phase, because drones may be pushed
+#: Maximum number of pairs for which checking them one at a time is faster.
 FEW_PAIRS = 6
 
 
@@ -33,25 +33,25 @@ FEW_PAIRS = 6
 class Contacts:
     """The contacts during one step."""
 
-    standing: set[int] = field(default_factory=set)  #: drones supported from below by something other than a drone
-    #: pairs of drones in which one stands on the other, upper one first
+    standing: set[int] = field(default_factory=set)  #: drones standing on an object that is not a drone
+    #: pairs of drones of which one stands on the other, with the upper drone first
     upon: list[tuple[int, int]] = field(default_factory=list)
-    #: drone, speed along the normal [m/s], and the name of the other object
+    #: drone, speed along the normal [m/s], and name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class _Near:
-    """Everything that is within the drones' reach until the next broad phase."""
+    """Everything that the drones can reach before the next broad phase."""
 
-    one: Indices  #: index of the first drone in each pair of drones within reach, the lower of the two
+    one: Indices  #: index of the first drone (the lower index) in each pair of drones within reach
     other: Indices  #: the second drone of each pair
     across: Floats  #: the square of the sum of the pair's radii
     upright: Floats  #: the square of the sum of the pair's half heights
-    #: the solids within reach, by drone; drones that are only near a wall or the ceiling have none
+    #: the solids within reach, by drone; drones that are near only a wall or the ceiling have no entry
     solids: dict[int, list[int]]
     who: Indices  #: index of the drone in each pair of a drone and a solid
-    what: Indices  #: number of the solid in each of these pairs
+    what: Indices  #: index of the solid in each of these pairs
     sizes: Floats  #: sizes of the solids; see :meth:`Solids.sizes`
     moving: bool  #: whether one of these solids is moving
     walled: Indices  #: drones that can reach a wall or the ceiling
@@ -60,7 +60,7 @@ class _Near:
 
 
 class Collisions:
-    """Keeps drones out of solids and away from one another. Called once per step."""
+    """Keeps drones out of solids and apart from one another. Called once per step."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], bodies: BodyTable, solids: Solids) -> None:
         self._bodies = bodies
@@ -69,22 +69,22 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for centres
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # limits for the centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
         self._feet = self._hull[2]
-        # Row views, because writing single numbers to rows is faster than to columns.
+        # Views of the rows, because writing single numbers to rows is faster than writing them to columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # last position at which each drone was clear of all fixed objects
         self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
         self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # step of the next broad phase
-        self._reach = np.zeros(len(parameters))  # distance that each drone can move until then
-        self._extra_reach = [0.0 for _ in parameters]  # additional movement caused by pushes and impacts
+        self._reach = np.zeros(len(parameters))  # distance that each drone can cover before the next broad phase
+        self._extra_reach = [0.0 for _ in parameters]  # additional movement that pushes and impacts cause
         self._run_broad_phase(0)
         self._next = 0
 
@@ -163,7 +163,7 @@ class Collisions:
         )
 
     def _extend_reach(self, drone: int, metres: float) -> bool:
-        """Extend how far a drone may move; return whether this exceeds the reach of the last broad phase."""
+        """Extend a drone's possible movement; return whether it exceeds the reach of the last broad phase."""
         self._extra_reach[drone] += metres
         return self._extra_reach[drone] > _SLACK_M
 
@@ -227,7 +227,7 @@ class Collisions:
             z = max(z + normal_z * overlap.depth_m, half_height)
             impact, more_x, more_y, faster = self._rebound(drone, overlap)
             carried += faster
-            # Friction also acts on this step's motion; otherwise a drone standing in wind would creep.
+            # Friction also affects the motion in this step; otherwise a drone standing in wind would creep.
             x, y = x + more_x * STEP_S, y + more_y * STEP_S
             if normal_z > 0.5:
                 contacts.standing.add(drone)
@@ -243,15 +243,15 @@ class Collisions:
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a wedged drone, which can't be pushed out of one object without entering another.
 
-        Horizontally the drone returns to its last clear position. Its vertical motion stays free, because the objects
-        that wedge it in don't support it. There is no friction: in a narrow enough corner the pressure would grow
-        without limit and hold the drone in the air forever.
+        In the horizontal plane, the drone returns to its last clear position. Its vertical motion remains free, because
+        the objects that wedge it in do not support it. There is no friction: in a narrow enough corner the pressure
+        would grow without limit and hold the drone in the air forever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
         self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
-        # All faces are horizontal or vertical, so the drone is blocked from above or below.
+        # All faces are horizontal or vertical, so if this step is reached, the drone is blocked from above or below.
         self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
@@ -287,7 +287,7 @@ class Collisions:
         return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
-        """Rotate the drone along with the turning surface below it, by friction over the whole contact disk.
+        """Rotate the drone with the turning surface below it, by friction over the whole contact disk.
 
         With pressure p = F / πR², the torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
@@ -297,7 +297,7 @@ class Collisions:
     # Drones ----------------------------------------------------------------------------------------------------
 
     def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
-        """Separate overlapping drones; return whether one might leave the broad phase's reach in the remaining time."""
+        """Separate overlapping drones; return whether one might leave the broad phase's reach in the time remaining."""
         strayed = False
         for one, other in self._close_pairs():
             if self._separate(one, other, left_s, contacts):
@@ -318,7 +318,7 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one might leave the broad phase's reach in the remaining time."""
+        """Separate two drones; return whether one might leave the broad phase's reach in the time left."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -337,7 +337,7 @@ class Collisions:
         mine = self._mass[other] / (self._mass[one] + self._mass[other])
         theirs = 1.0 - mine
         one_z, other_z = one_z + nz * depth * mine, other_z - nz * depth * theirs
-        # Neither drone may be pushed into the floor, so both are lifted instead.
+        # Neither drone may be pushed into the floor, so both of them are lifted instead.
         up = max(self._half_heights[one] - one_z, self._half_heights[other] - other_z, 0.0)
         self._x[one], self._y[one], self._z[one] = one_x + nx * depth * mine, one_y + ny * depth * mine, one_z + up
         self._x[other], self._y[other] = other_x - nx * depth * theirs, other_y - ny * depth * theirs

@@ -1,4 +1,4 @@
-"""The firmware's estimates, and its outer loops, which turn set-points and estimates into attitude and thrust.
+"""The firmware's state estimates, and its outer loops, which turn set-points and estimates into attitude and thrust.
 
 Estimates are the truth with noise and slowly wandering biases. The loops' formulas work both for the numbers of one
 drone and for arrays of all drones.
@@ -60,7 +60,7 @@ class Sensors:
         self.velocity: Floats = self._estimate[1:]  #: velocity forward, left, up in levelled axes, (3, n) [m/s]
         self._few = few(n)
         if self._few:
-            self.numbers = Fields(self._estimate, 0, 4)  #: altitude and velocity, for a few drones
+            self.numbers = Fields(self._estimate, 0, 4)  #: altitude and velocity, used if there are few drones
             self._each = list(enumerate(self._half_height.tolist()))
         self.estimate()
 
@@ -87,7 +87,7 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def put(self, drone: int) -> None:
-        """Replace the estimate of a drone that was moved and is at rest: the old one is for another position."""
+        """Replace a drone's estimate after it was moved and put at rest: the old one is for another position."""
         height = self._bodies.position[2, drone] - self._half_height[drone]
         self._estimate[:, drone] = self._bias[9:, drone]
         self._estimate[0, drone] += height
@@ -119,17 +119,17 @@ def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> 
 
 
 _REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehicle
-_HELD_M = 0.25  # minimum distance behind its descent at which a landing drone counts as held
-_HELD_CLIMB_M_S = 0.15  # maximum climb rate of a held drone; a faster one is still on its way
-_HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
-_HELD_REGAIN = 4.0  # factor by which the lag shrinks faster; otherwise the drone would drop when released
-_INTEGRATED_ERROR_M_S = 0.25  # limit of the integrated error: braking must not wind up the integral
-_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, for when a wall holds the drone back
+_HELD_M = 0.25  # minimum distance above its expected descent at which a landing drone is considered held up
+_HELD_CLIMB_M_S = 0.15  # maximum climb rate at which a drone counts as held up; a faster drone is simply still rising
+_HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre that the drone is further behind
+_HELD_REGAIN = 4.0  # factor by which the lag shrinks faster; otherwise the drone would drop when it is released
+_INTEGRATED_ERROR_M_S = 0.25  # limit for the integrated error, so that braking does not wind up the integral
+_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, which applies when a wall holds the drone back
 
 
 _ROWS = 15  # rows of the table: set-points, limits and the loops' state
 _STATE = 11  # first row of the loops' state
-_LANDING = 10  # index of the row that is greater than 0 while landing
+_LANDING = 10  # index of the row whose values are greater than 0 while landing
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ class _Gains:
 
 
 class ControlLoops:
-    """Set-points and state of the loops, one column per drone. The flight logic writes them between updates."""
+    """Set-points and state of the loops, one column per drone. The flight logic writes these between updates."""
 
     def __init__(
         self, parameters: Sequence[VehicleParameters], limits: Sequence[Limits], bodies: BodyTable, period_s: float
@@ -154,7 +154,7 @@ class ControlLoops:
         self._bodies = bodies
         self._period_s = period_s
         table = columns(_ROWS, n)
-        self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
+        self._set_point = table[:4]  # forward and left, or roll and pitch; then climb and yaw rate
         self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
         self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
         # The last row is the height of a landing drone above its expected descent.
@@ -209,13 +209,13 @@ class ControlLoops:
         self._landing[drone] = 0.0
 
     def land(self, drone: int, descent_m_s: float) -> None:
-        """Descend on the spot, whatever the set-point in force is."""
+        """Descend on the spot, regardless of the set-point in force."""
         self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
         self._landing[drone] = 1.0
         self._behind[drone] = 0.0
 
     def start(self, drone: int, altitude_m: float) -> None:
-        """Start the motors with the altitude reference at ``altitude_m``, the estimated altitude."""
+        """Start the motors, with the altitude reference set to ``altitude_m``, the estimated altitude."""
         self._running[drone] = 1.0
         self._reference[drone] = altitude_m
         self._integral[:, drone] = 0.0
@@ -232,7 +232,7 @@ class ControlLoops:
         self._bodies.steady(drone)
 
     def update(self, sensors: Sensors) -> None:
-        """Compute the inputs of the attitude loops and motors for one period."""
+        """Compute the inputs to the attitude loops and motors for one period."""
         bodies = self._bodies
         turned: Sequence[N]
         estimate: Sequence[N]
@@ -268,7 +268,7 @@ class ControlLoops:
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Get roll and pitch from the velocity error. The integral is in world axes, where yaw doesn't affect wind.
+        # Compute roll and pitch from the velocity error. The integral is in world axes, where yaw does not affect wind.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S
@@ -279,7 +279,7 @@ class ControlLoops:
         pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
-        if self._any_level_brake:  # drones under attitude control lean against their motion
+        if self._any_level_brake:  # drones under attitude control lean against their direction of motion
             brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
@@ -299,7 +299,7 @@ class ControlLoops:
         return commands, (reference, east, north, behind)
 
     def _fall_behind(self, do: Operations, climbing: N, descent: N, behind: N) -> N:
-        """Return how far a landing drone that is held up lags behind its descent [m], which reduces its thrust."""
+        """Return how far a landing drone that is held up lags behind its descent [m]; this lag reduces its thrust."""
         error = climbing - descent
         held = do.choose(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
         most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2

@@ -1,8 +1,8 @@
-"""Dynamics of quadrotors and wind in fixed steps, for many drones at once as array columns or for a few one by one.
+"""Dynamics of quadrotors and wind in fixed steps: arrays for many drones at once, or plain numbers for a few.
 
-NumPy takes as long for three numbers as for three hundred. A few drones are therefore faster one by one in plain
-floats, and many drones together in arrays. Both give the same bits, because they do the same operations in the same
-order and both use NumPy's sines and cosines; ``tests/sim/test_columns.py`` checks it.
+NumPy takes as long for three numbers as it takes for three hundred. A few drones are therefore faster one at a time in
+plain floats, and many drones are faster together in arrays. Both ways give the same bits, because they perform the same
+operations in the same order and both use NumPy's sines and cosines; ``tests/sim/test_columns.py`` checks this.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose
 from skyloop.sim.world import Wind
 
-N: TypeAlias = Any  #: a number for one drone, or an array with one for each
-FEW = 3  #: maximum number of drones that are computed one by one
+N: TypeAlias = Any  #: a number for one drone, or an array with one number per drone
+FEW = 3  #: maximum number of drones that are computed one at a time
 
 
 def few(drones: int) -> bool:
-    """Return whether this number of drones is computed one by one."""
+    """Return whether this number of drones is computed one at a time."""
     return drones <= FEW
 
 
@@ -36,7 +36,7 @@ def columns(rows: int, drones: int) -> Floats:
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns`, as plain floats for a few drones."""
+    """Consecutive rows of an array made by :func:`columns`; for a few drones, as plain floats."""
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
         rows, drones = table.shape
@@ -45,18 +45,18 @@ class Fields:
         numbers = Struct(f"{count}d")
         #: one function per drone that returns the drone's numbers
         self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
-        #: one function per drone that replaces its numbers with the same number of values
+        #: one function per drone, which replaces its numbers with the same number of values
         self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
 
 
 @dataclass(frozen=True, slots=True)
 class Operations:
-    """Operations that differ between numbers and arrays, so that one formula works for both."""
+    """Operations that differ between numbers and arrays, so that one formula can be used for both."""
 
     least: Callable[[N, N], N]  #: the smaller of two values
     most: Callable[[N, N], N]  #: the larger of two values
     root: Callable[[N], N]  #: the square root
-    choose: Callable[[N, N, N], N]  #: the second value where the first is true, otherwise the third
+    choose: Callable[[N, N, N], N]  #: the second value where the first one is true, and the third value elsewhere
 
 
 NUMBERS: Final = Operations(min, max, math.sqrt, lambda condition, one, other: one if condition else other)
@@ -89,9 +89,9 @@ class BodyTable(ABC):
         self._table = table
         #: Roll, pitch, yaw, (3, n) [rad], yaw not wrapped; derivatives; input: roll, pitch [rad], yaw rate [rad/s].
         self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
-        #: Input and actual value: thrust per mass, (n,) [m/s²].
+        #: Input and actual value: thrust divided by mass, (n,) [m/s²].
         self.thrust_command, self.thrust = table[12], table[22]
-        #: Sines and cosines of the angles; as input, the velocity of the air, (3, n) [m/s].
+        #: Sines and cosines of the angles; as an input, the velocity of the air, (3, n) [m/s].
         self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
         #: Position and velocity of the body's centre in world axes, (3, n) [m, m/s]; velocity before the last step.
         self.position, self.velocity, self.velocity_before = (table[row : row + 3] for row in (23, 26, 29))
@@ -106,11 +106,11 @@ class BodyTable(ABC):
 
     @abstractmethod
     def cut(self, drone: int) -> None:
-        """Stop the motors, so that nothing holds the attitude."""
+        """Stop the motors, so that the attitude is no longer controlled."""
 
     @abstractmethod
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, with the motors running or the legs on the ground."""
+        """Hold the attitude again, because the motors are running or the legs are on the ground."""
 
     @abstractmethod
     def step(self) -> None:
@@ -118,7 +118,7 @@ class BodyTable(ABC):
 
     @abstractmethod
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Change a body's turn rate about the vertical, counter-clockwise from above, from this step on."""
+        """Change a body's turn rate about the vertical, counter-clockwise from above, starting with this step."""
 
     @abstractmethod
     def power(self) -> Floats:
@@ -167,7 +167,7 @@ class Bodies(BodyTable):
             self._moving, self._moved = Fields(table, 12, 17), Fields(table, 22, 10)
             self._each = list(enumerate(self._constants()))
         else:
-            # Create a step's views and constants only once, because creating one takes as long as computing with it.
+            # Create a step's views and constants only once, because creating them takes as long as computing with them.
             self._a, self._b, self._squares = (np.empty((3, n)) for _ in range(3))
             self._a_rows, self._b_rows, self._square_rows = tuple(self._a), tuple(self._b), tuple(self._squares)
             self._c, self._d = np.empty(n), np.empty(n)
@@ -180,8 +180,8 @@ class Bodies(BodyTable):
         damping = column(parameters, lambda p: p.attitude_damping)
         yaw_rate = 1.0 / column(parameters, lambda p: p.yaw_time_constant_s)
         ones, zeros = np.ones_like(frequency), np.zeros_like(frequency)
-        # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. Yaw is
-        # different: the angle isn't held and the command is a rate.
+        # One formula serves all three axes: change of rate = stiffness (command - held · angle) - damping · rate. Yaw
+        # is different: its angle is not held, and its command is a rate.
         self._held = np.array([ones, ones, zeros])
         self._stiff_running = np.array([frequency**2, frequency**2, yaw_rate]) * STEP_S
         self._stiff[:] = self._stiff_running
@@ -227,7 +227,7 @@ class Bodies(BodyTable):
         self.angles[2, drone] += change_rad_s * STEP_S
 
     def power(self) -> Floats:
-        """Return each drone's current battery power, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
+        """Return each drone's current battery power, (n,) [W]: P ~ T^1.5, according to momentum theory in hover."""
         power: Floats = self._hover_power * (self.thrust / GRAVITY_M_S2) ** 1.5 + self._electronics_power
         return power
 
@@ -240,7 +240,7 @@ class Bodies(BodyTable):
             self._move()
 
     def _step_each(self) -> None:
-        """Do the work of :meth:`_turn` and :meth:`_move`, drone by drone."""
+        """Do the work of :meth:`_turn` and :meth:`_move` for one drone at a time."""
         for drone, (constants, _) in self._each:
             self._turn_one(drone, *constants)
         np.sin(self.angles, out=self.sin)
@@ -325,7 +325,7 @@ class Bodies(BodyTable):
         np.cos(self.angles, out=self.cos)
 
     def _tilt_by_airspeed(self) -> Floats:
-        """Return the roll and pitch that the airflow adds to the commands, shape (2, n): it lifts the leading side."""
+        """Return the roll and pitch that airflow adds to the commands, shape (2, n); it lifts the leading side."""
         east, north = self.velocity[:2] - self.air[:2]
         sin_yaw, cos_yaw = self.sin[2], self.cos[2]
         forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
@@ -339,7 +339,7 @@ class Bodies(BodyTable):
         total, drag, squares = self._a, self._b, self._squares
         sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw = self._sines_and_cosines
         (x, y, z), side, forward = self._a_rows, self._b_rows[0], self._d
-        # The third column of Rz(yaw) Ry(pitch) Rx(roll).
+        # This is the third column of Rz(yaw) Ry(pitch) Rx(roll).
         np.multiply(sin_pitch, cos_roll, out=forward)
         np.multiply(cos_yaw, forward, out=x)
         np.multiply(sin_yaw, sin_roll, out=side)
@@ -408,7 +408,7 @@ def rotations(sin: Floats, cos: Floats) -> Floats:
 
 
 class WindField:
-    """Air velocity at each drone: the world's mean wind and independent gusts, because gusts are small in extent.
+    """Air velocity at each drone: the world's mean wind plus independent gusts, because gusts are small in extent.
 
     Gusts are a first-order Gauss-Markov process per axis (the low-pass part of the Dryden gust model of MIL-F-8785C).
     """

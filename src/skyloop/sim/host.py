@@ -26,7 +26,7 @@ TICK_S: Final = 0.008  #: simulated time per batch of steps
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A drone's estimated and true state, and the targets, at a point in time."""
+    """The estimated and true state of a drone, and the targets, at a point in time."""
 
     believed: VehicleFeedback
     truth: VehicleTruth
@@ -42,14 +42,14 @@ class Observer(Protocol):
     def happened(self, occurrence: Occurrence) -> None: ...
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many frames per second from this camera are in use: 0 for none, infinity for all."""
+        """Return how many frames per second of this camera are in use: 0 for none, infinity for all."""
 
     def failed(self, error: Exception) -> None:
         """Handle a failure of the simulation, after which there are no more reports."""
 
 
 class SimHost:
-    """Several drones in one world, numbered from 0, each with one :class:`Observer`: a driver or emulated firmware.
+    """Several drones in one world, numbered from 0. Each has one :class:`Observer`: a driver or emulated firmware.
 
     The world is stepped while at least one observer is attached.
     """
@@ -68,9 +68,9 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, as a thread that is ending may still be in a step
         self._lock = threading.Lock()
-        #: Observers and cameras by drone; replaced as a whole, never modified.
+        #: Observers and cameras by drone; always replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
         self._stepper: Stepper | None = None
 
@@ -82,7 +82,7 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Reports arrive on the thread that steps the world, and ``screen`` gets the frames on the rendering thread. A
+        Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread. A
         drone has one observer: for a second one this raises UsageError.
         """
         if not 0 <= drone < self.drones:
@@ -97,7 +97,7 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; do nothing if it is not the attached one. The last one stops the world.
+        """Stop reporting to an observer; do nothing if a different observer is attached. The last one stops the world.
 
         No report is running when this returns.
         """
@@ -138,15 +138,15 @@ class Stepper(Protocol):
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Wait for the current round of reports. Afterwards no frames from these cameras are delivered."""
+        """Wait for the current round of reports. After this call, no frames from these cameras are delivered."""
 
 
 class ReportPublisher:
-    """Publishes reports to a host's observers and triggers the cameras that are due after each batch of steps."""
+    """Publishes reports to a host's observers and, after each batch of steps, triggers the cameras that are due."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Pipeline]) -> None:
         """Initialise the publisher; ``make_pipeline`` is called when the first frame is requested."""
-        self.pipeline: Pipeline | None = None  #: created when the first frame is requested
+        self.pipeline: Pipeline | None = None  #: created when a frame is requested for the first time
         self._host = host
         self._make_pipeline = make_pipeline
         self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
@@ -190,7 +190,7 @@ class ReportPublisher:
 
 
 class _RealTimeStepper:
-    """Runs a world in real time: one thread steps it and publishes reports, and another one renders."""
+    """Runs a world in real time: one thread steps it and publishes reports, and another thread renders."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
@@ -230,7 +230,7 @@ class _RealTimeStepper:
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
                     self._report_slowness()
-        except Exception as error:  # noqa: BLE001  reported to every driver so that the thread does not end silently
+        except Exception as error:  # noqa: BLE001 reported to every driver, so that the thread does not end silently
             for observer, _ in self._host.observers.values():
                 observer.failed(error)
 

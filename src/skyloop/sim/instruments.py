@@ -1,4 +1,4 @@
-"""A rotor-level drone's instruments as read by its firmware, with noise, bias, rate and delay.
+"""The instruments of a rotor-level drone as its firmware reads them, with noise, bias, rate and delay.
 
 All worlds have their origin at the same place on Earth: in Zürich, where PX4's simulations start by default.
 """
@@ -20,7 +20,7 @@ from skyloop.sim.world import Vec3
 
 
 class GpsFix(msgspec.Struct, frozen=True, gc=False):
-    """A fix from a satellite receiver, with its error and delay. Altitude is above mean sea level."""
+    """A satellite receiver's position fix, with its error and delay. Altitude is above mean sea level."""
 
     time_s: float  #: simulation time at which the receiver was at this position
     latitude_deg: float
@@ -35,9 +35,9 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
 class FlowSample(msgspec.Struct, frozen=True, gc=False):
     """Motion seen by a camera that looks down, over an interval.
 
-    Angles are about the body's forward and left axes, as if the vehicle had rotated by them above very distant ground.
-    A drone at height h that flies forward at v and rotates at ω about its left axis sees ω - v/h; one that flies left
-    at v and rotates at ω about its forward axis sees ω + v/h.
+    Angles are about the body's forward and left axes, as if the vehicle had rotated by these angles above very distant
+    ground. A drone at height h that flies forward at v and rotates at ω about its left axis sees ω - v/h; a drone that
+    flies left at v and rotates at ω about its forward axis sees ω + v/h.
     """
 
     interval_s: float
@@ -51,8 +51,8 @@ class FlowSample(msgspec.Struct, frozen=True, gc=False):
 class Readings(msgspec.Struct, frozen=True, gc=False):
     """The readings of a drone's instruments at a point in time, together with its true state.
 
-    Body axes are forward, left, up; world axes are east, north, up. The barometer, magnetometer and range finder keep
-    their newest sample until the next one.
+    Body axes are forward, left, up; world axes are east, north, up. The values of the barometer, magnetometer and range
+    finder remain until their next sample.
     """
 
     time_s: float  #: simulation time
@@ -61,12 +61,12 @@ class Readings(msgspec.Struct, frozen=True, gc=False):
     pressure_pa: float
     temperature_c: float
     magnetic_gauss: Vec3  #: magnetic field in body axes
-    gps: GpsFix | None  #: a new fix; None except in the step in which it arrives
-    range_m: float | None  #: distance down along the body's axis to the floor or a solid; None if out of range
-    flow: FlowSample | None  #: a new sample; None except in the step in which it arrives
+    gps: GpsFix | None  #: a new fix, or None except in the step in which the fix arrives
+    range_m: float | None  #: distance to the floor or a solid, down along the body's axis; None if out of range
+    flow: FlowSample | None  #: a new sample, or None except in the step in which the sample arrives
     battery_v: float
     battery_a: float
-    position_m: Vec3  #: true position of the body's centre
+    position_m: Vec3  #: true position of the centre of the body
     velocity_m_s: Vec3  #: true velocity in world axes
     quaternion: tuple[float, float, float, float]  #: true rotation, world from body: w, x, y, z
     rates_rad_s: Vec3  #: true rates about the body's axes
@@ -76,7 +76,7 @@ class Firmware(Protocol):
     """Flies one drone of a simulation; see :meth:`~skyloop.sim.simulation.Simulation.fly_by`."""
 
     def exchange(self, readings: Readings) -> Sequence[float] | None:
-        """Process a step's readings and return the rotor commands for the step.
+        """Process the readings of a step and return the rotor commands for that step.
 
         Called once per step of the plant (1 ms) on the thread that steps the simulation, which holds the simulation's
         lock. It must return in bounded time and call no method of the simulation.
@@ -86,7 +86,7 @@ class Firmware(Protocol):
 
         Returns:
             Rotor commands, 0 (stopped) to 1 (full): front left, front right, rear left, rear right. Values outside this
-            range are clamped. None keeps the last commands.
+            range are clamped. If None, the last commands remain in force.
 
         Raises:
             Exception: Any exception ends the step, and :meth:`Simulation.step` raises it.
@@ -98,7 +98,7 @@ LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
 LONGITUDE_DEG: Final = 8.545594
 ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
-#: The Earth's magnetic field at the worlds' origin, east, north, up, from the World Magnetic Model 2025 for early 2026.
+#: The Earth's magnetic field at the worlds' origin: east, north, up, from the World Magnetic Model 2025 for early 2026.
 MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
 
 _EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
@@ -120,7 +120,7 @@ _DEG_PER_EAST_M = math.degrees(1 / ((_NORMAL_M + ALTITUDE_M) * math.cos(math.rad
 def geodetic(position_m: Vec3) -> Vec3:
     """Return the latitude, longitude [deg] and altitude above mean sea level [m] of a position in world axes.
 
-    The Earth is treated as flat; at a distance of one kilometre the error is below 0.1 m.
+    The Earth is treated as flat; at a distance of one kilometre, the error is below 0.1 m.
     """
     east, north, up = position_m
     return LATITUDE_DEG + north * _DEG_PER_NORTH_M, LONGITUDE_DEG + east * _DEG_PER_EAST_M, ALTITUDE_M + up
@@ -143,8 +143,8 @@ Ranging = Callable[[Vec3, Vec3], float]
 
 _NOISE_BLOCK = 256  # number of samples whose noise is drawn in one call
 _WANDER_STEPS = 100  # number of steps between changes of the biases (10 Hz)
-_LEAST_FLOW_M = 0.08  # minimum height; any lower, the image is out of focus
-_GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal one
+_LEAST_FLOW_M = 0.08  # minimum height; below it, the image is out of focus
+_GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal error
 _SATELLITES = 14
 
 
@@ -182,12 +182,12 @@ class Instruments:
             )
         )
         self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
-        self._fixes: deque[tuple[int, GpsFix]] = deque()  # fixes, each with the step in which it arrives
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # GPS fixes, each with the step in which it arrives
         self._magnetic: Vec3 = (0.0, 0.0, 0.0)
         self._pressure_pa = 0.0
         self._below_m = math.inf
         self._range_m: float | None = None
-        self._turned = (0.0, 0.0, 0.0, 0.0)  # rotation about forward and left: true, then gyro
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # rotation about the forward and left axes: the true one, then the gyro's
         self._first = -1
 
     def read(
@@ -201,7 +201,7 @@ class Instruments:
         battery_v: float,
         battery_a: float,
     ) -> Readings:
-        """Return the readings for a step of the plant. Call this for every step in order."""
+        """Return the readings for one step of the plant. Call this method for every step, in order."""
         if step % _WANDER_STEPS == 0:
             self._bias = next(self._wandering)
         errors, bias = self._errors, self._bias
@@ -303,7 +303,7 @@ def _to_body(quaternion: tuple[float, float, float, float], vector: Vec3) -> Vec
 
 
 def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[float, ...]]:
-    """Yield standard normal numbers endlessly, ``count`` at a time."""
+    """Yield standard normal numbers indefinitely, ``count`` at a time."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
     while True:
         yield from map(tuple, generator.standard_normal((_NOISE_BLOCK, count)).tolist())
@@ -312,7 +312,7 @@ def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[
 def _wandering(
     seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constants_s: np.typing.NDArray[np.float64]
 ) -> Iterator[list[float]]:
-    """Yield biases endlessly: first-order Gauss-Markov processes, updated every :data:`_WANDER_STEPS`."""
+    """Yield biases indefinitely: first-order Gauss-Markov processes, updated every :data:`_WANDER_STEPS`."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + 7)
     keep = np.exp(-_WANDER_STEPS * PLANT_STEP_S / constants_s)
     fresh = np.sqrt(1.0 - keep * keep)

@@ -1,7 +1,7 @@
-"""True image boxes of objects in a camera's view, with visible fractions, for training, tests and benchmarks.
+"""True image boxes of objects in a camera's view, with their visible fractions, for training, tests and benchmarks.
 
-They are drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the
-pixels that each would cover if nothing occluded it.
+The boxes use the same geometry as the renderer, without colours: one map gives the target or crate visible at each
+pixel, the other the pixels that each would cover if nothing occluded it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import FigureTarget, TargetState, World
 
-CLASS_NAMES = ("person", "car", "box")  #: label classes; those of boards and platforms are not included
+CLASS_NAMES = ("person", "car", "box")  #: label classes; boards and platforms have none
 _CLEAR_M = 0.35  # minimum distance between a camera and solids
 _LONGEST_STEP_S = 20.0  # maximum time between two images from ``pictures``; tracks keep only 60 s
 
@@ -39,11 +39,11 @@ class TargetBox:
     #: x, y of the upper left corner, width and height [px] of the object's whole extent within the image
     box: tuple[int, int, int, int]
     visible: float  #: fraction of the object's pixels within the image that are not occluded, 0 to 1
-    cut: bool  #: whether the object reaches the outermost pixels, so that the image's edge may cut it off
+    cut: bool  #: whether the object touches the outermost pixels, in which case the image's edge may cut it off
 
 
 class Labeller:
-    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time."""
+    """Finds the bounding boxes in a scene. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -57,7 +57,7 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first."""
+        """Return the box of every target and crate with a pixel in the image, even a hidden one; targets come first."""
         raster = Raster.of(model, 1)
         posed = self._scene.posed(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
@@ -89,15 +89,15 @@ class Labeller:
 def pictures(
     world: World,  # the world
     seed: int,  # seed of the positions and times
-    count: int,  # number of images
+    count: int,  # number of images to yield
     size: tuple[int, int] = (320, 240),  # width and height of the images [px]
     focal_share: float = 0.75,  # focal length as a fraction of the width
     *,
     # camera to use instead of ``size`` and ``focal_share``, but without its sensor's imperfections
     camera: CameraModel | None = None,
-    tilt_rad: float | None = None,  # maximum random pitch and roll, in either direction
+    tilt_rad: float | None = None,  # maximum random pitch and roll, in both directions
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
-    """Yield labelled images of a world from random positions at random times.
+    """Yield labelled images of a world, captured from random positions at random times.
 
     Cameras are 0.7 to 3 m high and outside of solids; two thirds of them look roughly at a target. Pitch is at most 15°
     and roll is small, unless ``tilt_rad`` sets both.

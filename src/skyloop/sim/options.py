@@ -16,7 +16,7 @@ from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-#: Actions that simulated vehicles support natively; the proxy flies them to positions and back to the start.
+#: Actions that simulated vehicles support natively; the proxy itself flies them to positions and back to the start.
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
 MOST_LAG_S: Final = 0.25  #: default for the lag behind the clock beyond which steps are skipped
@@ -36,13 +36,13 @@ class SimOptions:
     quality: str = "smooth"  #: image quality: ``fast``, ``smooth`` or ``best``
     native: frozenset[str] = EVERY_ACTION  #: actions that the drone's driver supports natively
     position: bool = True  #: whether the drone reports its position
-    velocity: bool = True  #: whether the drone reports its velocity, which it always uses for its own flight
+    velocity: bool = True  #: whether the drone reports its velocity; it always uses the velocity for its own flight
     truth: bool = True  #: whether the drone also reports its true state
     rate_hz: float = 40.0  #: number of reports per second
-    most_lag_s: float = MOST_LAG_S  #: maximum lag of the world behind the clock before it skips steps [s]
+    most_lag_s: float = MOST_LAG_S  #: the world skips steps if it lags behind the clock by more than this [s]
     parameters: VehicleParameters = STANDARD_VEHICLE
     autopilot: str | None = None  #: real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``
-    #: folder for the firmware's settings; None to keep them only as long as the drone exists
+    #: folder for the firmware's settings; if None, they are kept only as long as the drone exists
     autopilot_folder: str | None = None
 
     def load_world(self) -> World:
@@ -61,16 +61,16 @@ class SimOptions:
 
 
 _LONGEST_RUN_STEPS = 25  # maximum number of steps per call when running in real time
-SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation counts as too slow
-SLOW_NS = 5 * NS_PER_S  #: time over which the speed is measured
+SLOW_SHARE = 0.95  #: a simulation below this fraction of its speed counts as too slow
+SLOW_NS = 5 * NS_PER_S  #: period over which the speed is measured
 SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
 
 
 class Pacer:
     """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    The pacer catches up on small delays. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in
-    ``lost_s``, and the deadlines are postponed. Not thread-safe: one thread owns the pacer::
+    The pacer catches up on small delays. If the lag exceeds ``most_lag_s``, the excess is skipped and counted in
+    ``lost_s``, and the deadlines are postponed. Not thread-safe: a pacer must be used by one thread only::
 
         while not stop.wait(pacer.run_due()):
             publish()
@@ -84,7 +84,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store ``step(n)``, which runs n steps, and ``speed``, the simulated seconds per second of the clock."""
+        """Store ``step(n)``, which runs n steps, and ``speed``, the simulated seconds per second of clock time."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step
@@ -106,7 +106,7 @@ class Pacer:
             self._start_ns += round(excess)
             self.lost_s += excess / NS_PER_S
             behind -= round(excess)
-        # At high speeds, use longer batches, so that control returns less often than once per step.
+        # At high speeds, use longer batches so that control returns less often than once per step.
         most = max(_LONGEST_RUN_STEPS, int(_LONGEST_RUN_STEPS * self._speed))
         steps = min(int(behind / self._ns_per_step) + 1, most)
         self._step(steps)
@@ -114,7 +114,7 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Return the clock time at which the simulation reached, or will reach, a time since this pacer's start."""
+        """Return the clock time at which the simulation reached, or will reach, a time since the pacer's start."""
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:
@@ -130,7 +130,7 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due, otherwise None."""
+        """Return the achieved fraction of the simulation's speed if a warning is due, or None otherwise."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None

@@ -1,7 +1,7 @@
 """Parameters that describe a simulated vehicle's flight, rotors and instruments.
 
-The defaults describe an AR.Drone 2 with its indoor hull, as far as public sources go. Values without a source are
-marked as estimates.
+The defaults describe an AR.Drone 2 with its indoor hull, to the extent that public sources describe it. Values without
+a source are marked as estimates.
 
 Sources: [P] Parrot, AR.Drone 2.0 technical specifications. [E] J. Engel, J. Sturm, D. Cremers, "Camera-Based
 Navigation of a Low-Cost Quadrocopter", IROS 2012, with the constants c1 … c7 identified from flights, as used in its
@@ -19,9 +19,9 @@ from typing import Any
 from skyloop.errors import UsageError
 from skyloop.sim.world import Vec3
 
-#: Rotors are numbered front left, front right, rear left, rear right. Seen from above, the first and the last turn
-#: clockwise and the others counter-clockwise, as in the X quadrotors of Betaflight, ArduPilot and PX4. A rotor's torque
-#: therefore turns the body counter-clockwise (1, yaw to the left) or clockwise (-1).
+#: Rotors are numbered front left, front right, rear left, rear right. Seen from above, the first and last rotors turn
+#: clockwise and the other two counter-clockwise, as in the X quadrotors of Betaflight, ArduPilot and PX4. A rotor's
+#: torque therefore turns the body counter-clockwise (1, yaw to the left) or clockwise (-1).
 YAW_SIGNS = (1.0, -1.0, -1.0, 1.0)
 
 Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -68,9 +68,9 @@ class InstrumentParameters:
 class RotorParameters:
     """Rotors, air, inertia and power train of a quadrotor.
 
-    A rotor turning at ω produces the thrust ``thrust_n_s2`` ω² and a torque of ``torque_m`` times that. It follows its
-    command with a first-order lag. A command of 0 stops it; above 0, its speed is between ``idle_speed_rad_s`` and
-    ``full_speed_rad_s`` in proportion. Both speeds are for a full battery and decrease with the voltage.
+    A rotor turning at ω produces a thrust of ``thrust_n_s2`` ω², and a torque of ``torque_m`` times the thrust. It
+    follows its command with a first-order lag. A command of 0 stops the rotor; above 0, its speed rises linearly from
+    ``idle_speed_rad_s`` to ``full_speed_rad_s``. Both speeds are for a full battery and decrease with the voltage.
     """
 
     #: positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`
@@ -79,16 +79,16 @@ class RotorParameters:
     thrust_n_s2: float  #: thrust per speed squared
     torque_m: float  #: torque per thrust
     idle_speed_rad_s: float  #: lowest speed of a running rotor
-    full_speed_rad_s: float  #: speed at full command
+    full_speed_rad_s: float  #: rotor speed at full command
     speed_up_s: float  #: time constant of an accelerating rotor
     speed_down_s: float  #: time constant of a decelerating rotor
-    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. It is
-    #: caused by blade flapping and the blades' asymmetric drag.
+    #: Force opposing the airspeed in the plane of the rotors, per airspeed and per sum of the rotors' speeds. The force
+    #: is caused by blade flapping and the blades' asymmetric drag.
     rotor_drag_kg: float
-    rotor_inflow_kg: float  #: the same along the rotors' axes, where air from above reduces the thrust
+    rotor_inflow_kg: float  #: the same force along the rotors' axes, where air from above reduces the thrust
     body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
-    efficiency: float  #: fraction of the battery's power that reaches the air as the shafts' torque times speed
-    #: inertia of a rotor about its axis: an accelerating rotor turns the body the other way
+    efficiency: float  #: fraction of the battery's power that is transferred to the air as shaft torque times speed
+    #: inertia of a rotor about its axis; when a rotor accelerates, the body turns the other way
     rotor_inertia_kg_m2: float = 0.0
     instruments: InstrumentParameters = field(default_factory=InstrumentParameters)
 
@@ -144,15 +144,15 @@ class VehicleParameters:
     """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
-    mass_kg: float = 0.42  # includes the indoor hull [P]; used only when drones collide; everything else is per mass
+    mass_kg: float = 0.42  # includes the indoor hull [P]; used only in drone collisions; everything else is per mass
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
-    linear_drag_per_s: float = 0.45  # with the next value, gives 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
+    linear_drag_per_s: float = 0.45  # together with the next value, gives 0.57 1/s at 3 m/s; [E] identified c1 = 0.58
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large
-    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. The tilt is
-    # this angle times the square of the horizontal airspeed, up to 3 m/s; blade flapping and wind on the hull cause it.
+    # This tilt raises the leading side in the airflow, as far as the attitude loops don't remove it. The tilt is this
+    # angle times the square of the horizontal airspeed, up to 3 m/s; blade flapping and wind on the hull cause it.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
@@ -164,12 +164,12 @@ class VehicleParameters:
     least_thrust: float = 0.3  # minimum thrust as a fraction of the weight while the motors run; estimate
 
     # Inner loops
-    attitude_frequency_rad_s: float = 16.0  # gives, with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
+    attitude_frequency_rad_s: float = 16.0  # together with the damping, gives a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
-    # Near level roll and pitch set-points, the firmware may lean against the motion: this is the deceleration per speed
-    # at a level set-point, which decreases in proportion to the tilt and is zero at full tilt.
+    # Near level roll and pitch set-points, the firmware may lean against the motion. This value is the deceleration per
+    # speed at a level set-point; it decreases in proportion to the tilt and is zero at full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
@@ -183,10 +183,10 @@ class VehicleParameters:
     battery_full_v: float = 12.5
     battery_empty_v: float = 9.6
     battery_resistance_ohm: float = 0.08  # estimate
-    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the power of the electronics
+    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, less the power of the electronics
     electronics_power_w: float = 5.0  # estimate
 
-    # Sensors: standard deviations of the noise, and of biases that wander with the time constant. Estimates for
+    # Sensors: standard deviations of the noise, and of the biases, which wander with the time constant. Estimates for
     # consumer parts.
     gyro_noise_rad_s: float = 0.01
     gyro_bias_rad_s: float = 0.005
@@ -207,8 +207,8 @@ class VehicleParameters:
     restitution: float = 0.35  # fraction of the normal speed after a bounce; estimate
     friction: float = 0.5  # Coulomb friction; estimate
 
-    #: Rotors of a vehicle modelled at rotor level (``docs/rotors.md``); None models its response as a whole. If
-    #: there are rotors, their own values replace the drag, motor time constant and hover power above.
+    #: Rotors of a vehicle modelled at rotor level (``docs/rotors.md``). If None, the vehicle's response is modelled as
+    #: a whole. If there are rotors, their own values replace the drag, motor time constant and hover power given above.
     rotors: RotorParameters | None = None
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ class VehicleFeedback:
 
     time_s: float  #: simulation time
     state: FlightState
-    emergency_reason: str  #: reason why the motors were cut; empty in other states
+    emergency_reason: str  #: reason why the motors were cut; empty in all other states
     battery: float  #: remaining charge, 0 to 1
     battery_v: float
     roll_rad: float
@@ -36,7 +36,7 @@ class VehicleTruth:
 
     time_s: float
     state: FlightState
-    position_m: Vec3  #: position of the body's centre
+    position_m: Vec3  #: position of the centre of the body
     velocity_m_s: Vec3
     roll_rad: float
     pitch_rad: float
@@ -54,12 +54,12 @@ class OccurrenceKind(StrEnum):
     COLLISION = "collision"
     EMERGENCY = "emergency"
     BATTERY_LOW = "battery_low"
-    SLOW = "slow"  #: applies to all drones: the computer is too slow for the requested speed
+    SLOW = "slow"  #: applies to all drones: this computer is too slow for the requested speed
 
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """Something that happened to a drone. ``speed_m_s`` is a collision's speed along its normal, otherwise 0."""
+    """Something that happened to a drone. ``speed_m_s`` is the speed along the normal of a collision; otherwise 0."""
 
     kind: OccurrenceKind
     drone: int

@@ -1,7 +1,7 @@
-"""Formulas of the rotor-level model, which work for the numbers of one drone and for arrays of all drones. Pure.
+"""Formulas of the rotor-level model, which work both for the numbers of one drone and for arrays of all drones. Pure.
 
-Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give the
-same bits for numbers and arrays.
+Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give
+bit-identical results for numbers and arrays.
 
 Sources: [M] R. Mahony, V. Kumar, P. Corke, "Multirotor Aerial Vehicles: Modeling, Estimation, and Control of
 Quadrotor", IEEE Robotics & Automation Magazine 19(3), 2012: thrust and torque, blade flapping as a force that grows
@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors, by commanding them beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays for all drones. Forces and torques are per mass and per inertia."""
+    """Constants of one drone, or arrays for all drones. Forces are per mass, and torques per moment of inertia."""
 
     thrust: N
     idle_speed: N
@@ -95,7 +95,7 @@ class Constants:
 
 
 def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
-    """Return a vehicle's rotors; UsageError if it has none, because its response is modelled as a whole."""
+    """Return a vehicle's rotors; raise UsageError if it has none because its response is modelled as a whole."""
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
     return vehicle.rotors
@@ -110,7 +110,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
     rows = [[1.0] * 4, ys, [-x for x in xs], [rotors.torque_m * sign for sign in YAW_SIGNS]]
     _, roll, pitch, yaw = (np.linalg.inv(np.array(rows)) * (1.0, ix, iy, iz)).T.tolist()
-    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # values for each rotor
+    each = {"x": xs, "y": ys, "roll": roll, "pitch": pitch, "yaw": yaw}  # values that differ between the rotors
     return Constants(
         thrust=k,
         idle_speed=rotors.idle_speed_rad_s,
@@ -166,9 +166,9 @@ def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
 
 
 def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Four, N]:
-    """Change the rotors' speeds towards target speeds for a step of :data:`PLANT_STEP_S`.
+    """Move the rotors' speeds towards their target speeds for a step of :data:`PLANT_STEP_S`.
 
-    Return the speeds, and the reaction on the body as an angular acceleration about z.
+    Return the speeds and the reaction on the body, as an angular acceleration about z.
     """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
@@ -184,11 +184,11 @@ def advance(
     do: Operations,
     c: Constants,
     turning: Sequence[N],  # quaternion (w, x, y, z; world from body) and body rates
-    speeds: Four,  # rotor speeds, which are constant during the step
+    speeds: Four,  # rotor speeds, constant during the step
     twist: N,  # reaction of the rotors; see :func:`spin`
-    motion: Sequence[N],  # velocity of the air, position and velocity in world axes
-    knock: Three,  # acceleration in world axes by which contacts changed the body's velocity in the last step
-    legs: bool,  # whether any drone may be touching something that turns it onto its feet
+    motion: Sequence[N],  # velocity of the air, then position and velocity, all in world axes
+    knock: Three,  # acceleration in world axes that corresponds to the velocity change by contacts in the last step
+    legs: bool,  # whether any drone may be touching something that can turn it upright
 ) -> tuple[tuple[N, ...], tuple[N, ...], Three, N]:
     """Advance a rigid body by a step of :data:`PLANT_STEP_S`.
 
@@ -229,7 +229,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # The legs push with the supporting force, on a lever arm of at most the hull's radius.
+        # The legs exert the supporting force at a lever arm no longer than the hull's radius.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
@@ -258,10 +258,10 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the rotor speeds to command in order to turn the body at the wanted rates and lift it.
+    """Return the rotor speeds to command in order to turn the body at the wanted rates and produce the wanted thrust.
 
-    If the rotors can't do everything, roll and pitch take precedence, then the thrust per mass (at 0 the rotors stop);
-    yaw gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch take precedence, followed by the thrust per mass (at 0 the rotors
+    stop). Yaw gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -271,7 +271,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
     dr = _within(do, (want_r - r) * c.yaw_gain, most) + c.gyroscopic_z * p * q
     k, slowest, fastest = c.thrust, c.idle_speed * sag, c.full_speed * sag
     least, range_n = k * slowest * slowest, k * (fastest * fastest - slowest * slowest)
-    # All four contribute the same amount of yaw, so checking one of them is enough to see whether it is too much.
+    # All four rotors contribute the same yaw, so checking one is enough to tell whether the yaw is too large.
     yaw = _within(do, dr * c.yaw1, range_n * _YAW_SHARE) / c.yaw1
     d1 = dp * c.roll1 + dq * c.pitch1 + yaw * c.yaw1
     d2 = dp * c.roll2 + dq * c.pitch2 + yaw * c.yaw2
@@ -302,7 +302,7 @@ def electric_power(c: Constants, speeds: Four) -> N:
 
 
 def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tuple[N, N]:
-    """Return a battery's voltage [V] and current [A] under a power [W], from its unloaded and previous voltage."""
+    """Return a battery's voltage [V] and current [A] under a power [W], given its unloaded and previous voltages."""
     current = power / do.most(voltage, 1.0)
     # A battery delivers its maximum power at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current

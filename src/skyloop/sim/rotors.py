@@ -1,6 +1,6 @@
-"""Bodies modelled at rotor level in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
+"""Bodies modelled at rotor level in steps of 1 ms, at any attitude, flown by firmware or by the built-in loops.
 
-As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays, a few one by one, with bit-identical results.
+As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays and few one at a time, with bit-identical results.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from skyloop.sim.world import vec3
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
-# First rows of the entries that this table adds to BodyTable's, and its total number of rows.
+# First rows of the entries that this table adds to those of BodyTable, and its total number of rows.
 _TURNING, _SPEEDS, _TARGETS, _ROWS = 0, 7, 16, 29
-_AIR, _LEAST_COS = 19, 1e-6  # BodyTable's first row of air, thrust, position, velocity; minimum cosine
+_AIR, _LEAST_COS = 19, 1e-6  # BodyTable's first row of air, thrust, position and velocity; minimum cosine
 _IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %
 _ROTOR_MARGIN_M_S2 = 60.0  # margin for gravity, ground effect, and drag in a fast dive
 
@@ -83,15 +83,15 @@ class RotorBodies(BodyTable):
     # Inputs ----------------------------------------------------------------------------------------------------
 
     def cut(self, drone: int) -> None:
-        """Stop the rotors, so that nothing holds the attitude."""
+        """Stop the rotors, so that the attitude is no longer controlled."""
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Do nothing: running rotors hold the attitude, and so does the ground below a drone."""
+        """Do nothing: running rotors hold the attitude, and so does the ground under a landed drone."""
 
     def fly_by(self, drone: int, firmware: Firmware, instruments: Instruments) -> None:
-        """Have firmware fly a drone from the next step on."""
+        """Let firmware fly a drone, starting with the next step."""
         self._pilots = {**self._pilots, drone: _Pilot(self, drone, firmware, instruments)}
         self._flown[drone] = True
         self._targets[:, drone] = 0.0
@@ -240,7 +240,7 @@ class RotorBodies(BodyTable):
 
     def _derive(self) -> None:
         """Compute angles, with their sines, cosines and derivatives, from the quaternions."""
-        # Kept in separate arrays, because NumPy's functions may give different bits for different strides.
+        # Kept in separate arrays, because NumPy's functions may give different results for different strides.
         quaternion = np.ascontiguousarray(self.quaternion)
         (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation(*quaternion)
         level = np.sqrt(r21 * r21 + r22 * r22)
@@ -249,7 +249,7 @@ class RotorBodies(BodyTable):
         sin[0], sin[1], sin[2] = r21 / some, -r20, r10 / some
         cos[0], cos[1], cos[2] = r22 / some, level, r00 / some
         steep = level < _LEAST_COS
-        if steep.any():  # roll and yaw turn about the same axis, so all of it counts as yaw
+        if steep.any():  # roll and yaw turn about the same axis, so the entire rotation counts as yaw
             sin[0, steep], sin[2, steep] = 0.0, -r01[steep]
             cos[0, steep], cos[1, steep], cos[2, steep] = 1.0, _LEAST_COS, r11[steep]
         cos[0, cos[0] == 0.0] = _LEAST_COS  # avoids a division by zero
@@ -261,7 +261,7 @@ class RotorBodies(BodyTable):
 
 
 class _Pilot:
-    """Exchanges readings and commands with a drone's firmware."""
+    """Exchanges readings and commands with the firmware of a drone."""
 
     def __init__(self, bodies: RotorBodies, drone: int, firmware: Firmware, instruments: Instruments) -> None:
         self._bodies = bodies
@@ -272,7 +272,7 @@ class _Pilot:
     def exchange(self) -> None:
         bodies, drone = self._bodies, self._drone
         w, x, y, z = bodies.quaternion[:, drone].tolist()
-        # The ground supports a drone only at the end of each simulation step; in between, the drone falls.
+        # The ground supports a drone only at the end of each simulation step; during the step, the drone falls.
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,

@@ -1,7 +1,7 @@
-"""A world with drones, stepped by its owner.
+"""A world with drones that its owner advances step by step.
 
 It is deterministic: the same world, seed, drones and commands in the same steps give the same bits. Nothing here reads
-a wall clock; :class:`~skyloop.sim.options.Pacer` makes it run in real time.
+a wall clock; :class:`~skyloop.sim.options.Pacer` paces it to run in real time.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ class Simulation:
         Args:
             world: The world.
             drones: Number of drones, 1 to 1000.
-            seed: Seed for all noise and gusts. Together with the world's own seed it determines the simulation. None
-                uses the world's seed.
+            seed: Seed for all noise and gusts. Together with the world's own seed, this seed determines the simulation.
+                If None, the world's seed is used.
             parameters: Parameters for all drones, or for each drone.
             limits: Limits for all drones, or for each drone.
             charge: Initial charge of the batteries, greater than 0 and at most 1.
-            wind: Wind that replaces the world's own.
+            wind: Wind that replaces the wind of the world.
 
         Raises:
             UsageError: An argument is out of its range, some vehicles have rotors and others don't, or the world has no
@@ -150,7 +150,7 @@ class Simulation:
 
         Returns:
             The applied action: the action itself, a clamped set-point, or :class:`~skyloop.messages.Idle` if the drone
-            ignores it in its current state, as firmware does: set-points before hovering, a reset in the air.
+            ignores it in its current state, as firmware does: set-points before hovering, or a reset in the air.
 
         Raises:
             UsageError: There is no such drone, firmware flies it, or a number is not finite.
@@ -168,22 +168,22 @@ class Simulation:
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """Change a drone's limits from the next command on. A new ceiling takes effect immediately."""
+        """Change a drone's limits, starting with the next command. A new ceiling takes effect immediately."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
 
     def fly_by(self, drone: int, firmware: Firmware) -> None:
-        """Have firmware fly a drone from now on. Meanwhile the built-in autopilot refuses commands.
+        """Let firmware fly a drone from now on. Meanwhile the built-in autopilot refuses commands.
 
-        The drone counts as landed while it is on the ground and no rotor command exceeds 15 %, the idle of armed
-        firmware, and otherwise as flying. Collisions are reported as usual and don't stop rotors.
+        The drone counts as landed while it is on the ground and no rotor command exceeds 15 % (the idle of armed
+        firmware); otherwise it counts as flying. Collisions are reported as usual, but do not stop the rotors.
 
         Args:
-            drone: The drone's number. The drone must be on the ground; an emergency is reset.
+            drone: The drone's number. The drone must be on the ground; an emergency state is reset.
             firmware: Called once per millisecond of simulation time on the stepping thread.
 
         Raises:
-            UsageError: There is no such drone, it has no rotors, firmware already flies it, or it is in the air.
+            UsageError: There is no such drone, the drone has no rotors, firmware already flies it, or it is in the air.
         """
         with self._lock:
             self._require_built_in(drone)
@@ -205,9 +205,9 @@ class Simulation:
             rotors.fly_by(drone, firmware, instruments)
 
     def release(self, drone: int) -> None:
-        """Take a drone back from its firmware. Its rotors stop and the built-in autopilot takes over.
+        """Take a drone back from its firmware. Its rotors stop, and the built-in autopilot takes over.
 
-        A drone in the air falls in an emergency.
+        If it is in the air, the drone falls in an emergency.
         """
         with self._lock:
             if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
@@ -238,9 +238,9 @@ class Simulation:
             self._batteries.charge[self._number(drone)] = charge
 
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
-        """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
+        """Move a flying drone, which then hovers level and at rest, to start a new episode in the same simulation.
 
-        ``position_m`` is where its centre goes, in world axes. A drone that is not flying raises UsageError.
+        ``position_m`` is the new position of its centre, in world axes. A drone that is not flying raises UsageError.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -263,7 +263,7 @@ class Simulation:
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """Return a drone's estimates. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 12 ms older; their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()
@@ -303,15 +303,15 @@ class Simulation:
             )
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Return the true poses of all bodies as new arrays, for a renderer or for motion capture.
+        """Return the true poses of all bodies as new arrays, for a renderer or a motion-capture system.
 
-        They are positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
+        These are positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
         """
         with self._lock:
             return self._bodies.position.T.copy(), self._bodies.rotations()
 
     def motions(self) -> tuple[Floats, Floats, Floats]:
-        """Return the motion of all drones as new arrays, intended for tasks with many drones.
+        """Return the motion of all drones as new arrays, for tasks with many drones.
 
         Positions are true values in world axes, shape (n, 3) [m]; velocities forward, left and up are the drones'
         estimates, up to 12 ms older, shape (n, 3) [m/s]; roll, pitch and yaw (within ±π) are true, shape (n, 3) [rad].
@@ -336,7 +336,7 @@ class Simulation:
         return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
 
     def take_occurrences(self) -> list[Occurrence]:
-        """Return the occurrences since the last call, oldest first. Only the newest 1000 are kept."""
+        """Return the occurrences since the previous call, oldest first. Only the newest 1000 occurrences are kept."""
         with self._lock:
             taken = list(self._autopilot.occurrences)
             self._autopilot.occurrences.clear()

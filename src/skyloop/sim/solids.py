@@ -20,13 +20,13 @@ class Overlap(NamedTuple):
     """A drone's overlap with a solid or with the room's walls and ceiling."""
 
     normal: Vec3  #: direction out of the solid
-    depth_m: float  #: depth along that direction
+    depth_m: float  #: depth of the overlap along that direction
     surface_m_s: Vec3 = (0.0, 0.0, 0.0)  #: velocity of the solid's surface at the drone's centre
     spin_rad_s: float = 0.0  #: turn rate of the surface, counter-clockwise from above
 
 
 class Solids:
-    """Boxes, gate bars, moving platforms and figures, and the room's walls and ceiling, but not the floor."""
+    """Boxes, gate bars, moving platforms and figures, the room's walls and its ceiling, but not the floor."""
 
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
@@ -40,13 +40,13 @@ class Solids:
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
         # The same values as plain numbers, which are faster for a single box: centre, half the size, cosine and sine of
-        # yaw; velocity and turn rate.
+        # yaw, velocity, and turn rate.
         self._boxes = [(0.0,) * 8 for _ in sizes]
         self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
             self._place(number, box.position_m, box.yaw_rad)
         self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
-        self._bounded_m = math.nan  # radius for which ``_bounds`` is valid
+        self._bounded_m = math.nan  # radius of the hulls for which ``_bounds`` is valid
         size_x, size_y, height = world.room.size_m
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
@@ -56,23 +56,23 @@ class Solids:
         self.move(0.0)
 
     def __len__(self) -> int:
-        """Return the number of boxes, platforms and figures. They are numbered, with moving ones last."""
+        """Return the number of boxes, platforms and figures. Solids are numbered, with the moving ones last."""
         return len(self._boxes)
 
     def move(self, time_s: float) -> None:
         """Move the moving solids to their positions at a point in time."""
         for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self.fixed):
             state = track.at(time_s)
-            x, y, z = state.position_m  # a platform's top, a figure's footprint
+            x, y, z = state.position_m  # for a platform, its top; for a figure, its footprint
             half = float(self._half[2, number, 0])
             centre = (x, y, z - half if lifts else z + half)
             self._place(number, centre, state.yaw_rad, state.velocity_m_s, state.yaw_rate_rad_s)
 
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
-        """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
+        """Return bounding boxes, low and high, each (3, boxes) [m]. The bounds are valid until the next call.
 
         Moving solids stay within their boxes for ``seconds``, and a hull of ``radius_m`` touches a solid only if their
-        bounding boxes overlap. (To find the distance between a hull and a turned box's corner, treat the hull as a
+        bounding boxes overlap. (To find the distance between a hull and a corner of a turned box, treat the hull as a
         square turned the same way.)
         """
         if radius_m != self._bounded_m:
@@ -83,7 +83,7 @@ class Solids:
         return self._bounds
 
     def _bound(self, which: slice, reach_m: float) -> None:
-        """Compute the bounding boxes of some solids, enlarged by this reach on all sides."""
+        """Compute the bounding boxes of the given solids, enlarged by this reach on all sides."""
         c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
         x, y, z = self._half[:, which]
         corner = (c + s - 1.0) * self._bounded_m + reach_m
@@ -95,8 +95,8 @@ class Solids:
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
         """Return which of the points (3, m), m > 0, are inside their solids, as indices in ascending order.
 
-        For each point, ``numbers`` has the index of its solid, (m,), and ``sizes`` the result of :meth:`sizes` for that
-        solid and the point's hull.
+        For each point, ``numbers`` has the index of its solid, (m,), and ``sizes`` has the result of :meth:`sizes` for
+        that solid and the point's hull.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -105,12 +105,12 @@ class Solids:
         return found
 
     def sizes(self, numbers: Indices, hulls: Floats) -> Floats:
-        """Return the half sizes of solids enlarged by hulls (3, m), shape (3, m)."""
+        """Return the half sizes of solids, enlarged by hulls (3, m), shape (3, m)."""
         grown: Floats = self._half[:, :, 0].take(numbers, axis=1) + hulls
         return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
-        """Return the distance of drones at points (3, m) to the nearest solid, wall or ceiling, (m,).
+        """Return the distance between the points (3, m) of drones and the nearest solid, wall or ceiling, (m,).
 
         It never exceeds the true distance, and is negative inside a solid. ``hulls`` are radius, radius, half height,
         (3, m).
@@ -125,7 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all), if there is one."""
+        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all), if there is any."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None
@@ -158,7 +158,7 @@ class Solids:
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
         """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite if none.
 
-        The distance is 0 if the point is below the floor.
+        If the point is below the floor, the distance is 0.
         """
         if self._movers:
             self.move(time_s)
@@ -178,7 +178,7 @@ class Solids:
         x, y, z = direction
         starts = np.array([c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]])
         ways = np.array([c * x + s * y, c * y - s * x, np.full_like(c, z)])
-        # Treat a beam parallel to a face as almost parallel to it.
+        # Treat a beam that is parallel to a face as almost parallel.
         ways[np.abs(ways) < 1e-12] = 1e-12
         half = self._half[:, :, 0]
         one, other = (-half - starts) / ways, (half - starts) / ways
@@ -189,7 +189,7 @@ class Solids:
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
         if number >= self.fixed and self._lifts[number - self.fixed] and local[2] > 0:
-            axis = 2  # a platform lifts everything on it, whichever way it moves
+            axis = 2  # a platform lifts everything on it, regardless of its direction of motion
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
         if axis == 2:
@@ -230,21 +230,21 @@ Indices = NDArray[np.intp]
 
 
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
-    """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
+    """Return the pairs of overlapping boxes, found by a sweep along the axis on which they are spread widest.
 
-    Boxes extend from ``low`` to ``high``, each (3, n) [m]; those that touch overlap. At least one box of each pair is
-    among the first ``movable`` boxes. Pairs are sorted by their lower, then their higher number.
+    Boxes extend from ``low`` to ``high``, each (3, n) [m]; boxes that touch count as overlapping. At least one box of
+    each pair is among the first ``movable`` boxes. Pairs are sorted by their lower number, then by their higher number.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
     order = low[axis].argsort(kind="stable")
     begins, ends = low[axis, order], high[axis, order]
-    # In this order, a box overlaps, along the axis, the later boxes that begin before it ends.
+    # In this order, the boxes that a box overlaps along the axis are the later boxes that begin before it ends.
     numbers = np.arange(len(order))
     counts = begins.searchsorted(ends, side="right") - numbers - 1
     first = numbers.repeat(counts)
-    before = counts.cumsum() - counts  # number of pairs contributed by the preceding boxes
+    before = counts.cumsum() - counts  # number of pairs found for the preceding boxes
     second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
     one, other = order.take(first), order.take(second)
     for across in {0, 1, 2} - {axis}:
@@ -292,7 +292,7 @@ def _fill(
 
 
 def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[float, float]]:
-    """Return points of a square grid over the floor, starting with those nearest to ``around``."""
+    """Return the points of a square grid over the floor, starting with the points nearest to ``around``."""
     x0, y0 = around.position_m[:2] if around else (0.0, 0.0)
     reach_x, reach_y = (math.ceil(world.room.size_m[axis] / spacing) for axis in (0, 1))
     points = [

@@ -32,7 +32,7 @@ class Purpose(IntEnum):
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
     """Return the random stream for a purpose and an index (of a drone, target, camera or step). This takes about 15 µs.
 
-    The same arguments give the same stream in all versions.
+    The same arguments give the same stream in all versions of Skyloop.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), index)))
 
@@ -40,7 +40,7 @@ def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
 class NormalBlocks:
     """Standard normal random numbers for many drones, ``rows`` per drone at a time. Every drone has its own stream.
 
-    They are drawn in blocks, because a call to a generator costs as much as a hundred numbers.
+    They are drawn in blocks, because one call of a generator costs as much as a hundred numbers.
     """
 
     def __init__(self, seed: int, purpose: Purpose, rows: int, drones: int, ahead: int = 64) -> None:

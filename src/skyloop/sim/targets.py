@@ -1,4 +1,4 @@
-"""The motion of targets. Each path is a sequence of points on a fixed time grid, computed as far as requested.
+"""The motion of targets. Each path is a sequence of points on a fixed time grid, which is computed as far as requested.
 
 A target's position therefore depends only on the time and the seed.
 """
@@ -53,7 +53,7 @@ class TargetTrack:
         positions = _positions(target.path, stream(seed, Purpose.TARGETS, index))
         self._points = _with_yaw(positions, target.yaw)
         self._kept: deque[_Point] = deque(maxlen=round(KEPT_S / GRID_S) + 2)
-        self._known = 0  # number of points computed so far, whether still kept or not
+        self._known = 0  # number of points computed so far, including those no longer kept
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> TargetState:
@@ -67,7 +67,7 @@ class TargetTrack:
         yaw = wrap_angle(heading + part * (next_heading - heading))
         walked += part * (next_walked - walked)
         place = (position[0], position[1], position[2])
-        # Use the velocity between the points rather than at the first; otherwise a drone on a platform would creep.
+        # Use the velocity between the points rather than at the first one; otherwise a drone on a platform would creep.
         velocity = vec3((np.array(there) - np.array(here)) / GRID_S)
         rate = (next_heading - heading) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
@@ -95,7 +95,7 @@ def top_speed(path: Path) -> float:
 
 
 def _positions(path: Path, rng: np.random.Generator) -> Iterator[tuple[Vec3, Vec3]]:
-    """Yield position and velocity at 0, GRID_S, 2 GRID_S … without end."""
+    """Yield position and velocity at 0, GRID_S, 2 GRID_S … indefinitely."""
     if isinstance(path, WaypointPath):
         return _waypoints(path)
     if isinstance(path, CirclePath):
@@ -137,7 +137,7 @@ def _circle(path: CirclePath, time_s: float) -> tuple[Vec3, Vec3]:
 def _oval(path: OvalPath, time_s: float) -> tuple[Vec3, Vec3]:
     half, radius, bend = path.length_m / 2, path.radius_m, math.pi * path.radius_m
     along = (path.start_m + path.speed_m_s * time_s) % (2 * (path.length_m + bend))
-    back = along >= path.length_m + bend  # the second half is the first half rotated by half a turn
+    back = along >= path.length_m + bend  # the second half is the first half turned by 180°
     along -= (path.length_m + bend) * back
     if along < path.length_m:
         x, y, c, s = along - half, -radius, 1.0, 0.0
@@ -178,7 +178,7 @@ def _ring_goals(path: RingWalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
 def _steer(
     goals: Iterator[Vec3], speeds: tuple[float, float], acceleration: float, rng: np.random.Generator
 ) -> Iterator[tuple[Vec3, Vec3]]:
-    """Walk from goal to goal with each leg at its own speed, and with limited acceleration.
+    """Walk from goal to goal, at a different speed on each leg and with limited acceleration.
 
     A goal counts as reached at the braking distance, so that a reversal at the goal does not overshoot it.
     """
@@ -215,7 +215,7 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
 
 
 def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:
-    """Return the heading to turn to; None if there is none (at rest, or directly above the point to look at)."""
+    """Return the heading to turn to, or None if there is none (at rest, or directly above the point to look at)."""
     if isinstance(yaw, FixedYaw):
         return yaw.yaw_rad
     if isinstance(yaw, TowardsYaw):

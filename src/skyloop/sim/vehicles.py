@@ -1,6 +1,6 @@
 """Vehicles whose response was identified from recorded flights, and vehicles modelled at rotor level.
 
-Parameters not given here have their defaults. ``docs/rotors.md`` has a table of those for the rotor-level vehicles.
+Parameters not given have their defaults. ``docs/rotors.md`` tabulates the sources for the rotor-level vehicles.
 
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
@@ -26,7 +26,7 @@ AR_DRONE = VehicleParameters(
     attitude_frequency_rad_s=10.1,
     attitude_damping=0.65,
     linear_drag_per_s=0.396,
-    quadratic_drag_per_m=0.0,  # fitting it together with airspeed_tilt gave zero
+    quadratic_drag_per_m=0.0,  # fitting it together with airspeed_tilt yielded zero
     airspeed_tilt_rad_s2_per_m2=0.0147,
     level_brake_per_s=0.303,
 )
@@ -92,7 +92,7 @@ IRIS = VehicleParameters(
         speed_up_s=0.0125,  # [R]
         speed_down_s=0.025,  # [R]
         rotor_drag_kg=8.06428e-5,  # [R]
-        rotor_inflow_kg=8.06428e-5,  # estimate: same as the drag across
+        rotor_inflow_kg=8.06428e-5,  # estimate: same as the drag across the axis
         body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1; estimate
         efficiency=0.8,  # estimate for about 20 minutes in the air
     ),
@@ -101,13 +101,13 @@ IRIS = VehicleParameters(
 #: A Crazyflie 2, with a maximum thrust of 1.7 times its weight.
 CRAZYFLIE = VehicleParameters(
     mass_kg=0.028,  # [F]
-    radius_m=0.069,  # 46 mm to the rotors' axes [F] plus a rotor's radius
+    radius_m=0.069,  # 46 mm to the rotors' axes [F] plus the radius of a rotor
     half_height_m=0.0145,  # 29 mm high [B]
     rotor_radius_m=0.0231,  # 46 mm across [B]
     rotor_height_m=0.02,  # estimate
     most_thrust=1.5,  # leaves a seventh of the rotors' thrust for attitude control; estimate
     least_thrust=0.3,  # estimate
-    attitude_frequency_rad_s=17.0,  # together with the damping, gives the mean step response of the three in [D]
+    attitude_frequency_rad_s=17.0,  # together with the damping, gives the mean step response of all three in [D]
     attitude_damping=0.67,
     most_angular_acceleration_rad_s2=150.0,  # estimate
     battery_charge_c=900.0,  # 250 mAh [B]
@@ -127,7 +127,7 @@ CRAZYFLIE = VehicleParameters(
         speed_down_s=0.072,
         rotor_drag_kg=9.1785e-7,  # [F]
         rotor_inflow_kg=10.311e-7,  # [F]
-        body_drag_kg_m=(0.0, 0.0, 0.0),  # [F]: all drag grows with the rotors' speed
+        body_drag_kg_m=(0.0, 0.0, 0.0),  # [F]: all drag increases with the rotors' speed
         efficiency=0.5,  # estimate for 7 minutes in the air [B]
     ),
 )

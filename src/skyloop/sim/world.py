@@ -26,7 +26,7 @@ def vec3(values: NDArray[np.float64]) -> Vec3:
     return x, y, z
 
 
-# Surface names that a renderer must support. A world file with any other name is refused.
+# Surface names that a renderer must support. A world file with any other texture name is refused.
 TEXTURES: tuple[str, ...] = (
     "asphalt",
     "books",
@@ -66,8 +66,8 @@ class FacePose:
     """Pose of a flat object (poster, marker, board).
 
     ``yaw_rad`` and ``elevation_rad`` give the direction of the outward normal: its heading, and its angle above the
-    horizon (π/2 points straight up, as for a marker on the floor). ``turn_rad`` rotates the picture in its own plane,
-    counter-clockwise as seen from the front.
+    horizon (π/2 points straight up, as for a marker that lies on the floor). ``turn_rad`` rotates the picture in its
+    own plane, counter-clockwise as seen from the front.
     """
 
     position_m: Vec3
@@ -76,7 +76,7 @@ class FacePose:
     turn_rad: float = 0.0
 
     def rotation(self) -> NDArray[np.float64]:
-        """Return the world-from-face rotation, (3, 3); columns: the picture's right and up, the outward normal."""
+        """Return the world-from-face rotation, (3, 3); columns: picture's right, picture's up, outward normal."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         ce, se = math.cos(self.elevation_rad), math.sin(self.elevation_rad)
         right = np.array([-sy, cy, 0.0])
@@ -90,7 +90,7 @@ class FacePose:
 class Room:
     """The bounds of the world, which drones never leave.
 
-    If not ``enclosed``, the world has ground and sky but no visible walls or ceiling; its bounds then act like a net.
+    If not ``enclosed``, the world has ground and sky but no visible walls or ceiling; its bounds then act as a net.
     """
 
     size_m: Vec3  # x, y, z extents
@@ -102,7 +102,7 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A solid upright box: ``position_m`` is its centre, and ``size_m`` its extents along its own x, y, z."""
+    """A solid upright box: ``position_m`` is its centre, and ``size_m`` its extents along its own x, y and z axes."""
 
     name: str
     position_m: Vec3
@@ -129,7 +129,7 @@ class Gate:
     position_m: Vec3  #: position of the opening's centre
     inner_size_m: Vec2  #: width and height of the opening
     yaw_rad: float = 0.0  #: heading for flying through the gate
-    frame_m: float = 0.08  #: thickness of the bars
+    frame_m: float = 0.08  #: thickness of the frame's bars
     colour: Rgb = (235, 110, 20)
 
     def bars(self) -> tuple[Box, ...]:
@@ -161,7 +161,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A flat textured rectangle without thickness: a poster, a window, a door. Drones don't collide with it."""
+    """A flat textured rectangle without thickness: a poster, a window, a door. Drones don't collide with the panel."""
 
     name: str
     pose: FacePose
@@ -186,7 +186,7 @@ class MarkerPattern:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker with a fixed pose: that of its centre. The marker's own top is the top of the picture."""
+    """A printed marker with a fixed pose: the pose of its centre. The top of the marker is the top of the picture."""
 
     name: str
     pose: FacePose
@@ -215,7 +215,7 @@ class CirclePath:
 
 @dataclass(frozen=True, slots=True)
 class OvalPath:
-    """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
+    """A level race track flown at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
     It starts ``start_m`` after the beginning of the southern straight, or of the northern one if clockwise.
     """
@@ -241,10 +241,10 @@ class LissajousPath:
 
 @dataclass(frozen=True, slots=True)
 class WalkPath:
-    """A seeded random walk between points in a box, with each leg at a speed drawn from a range.
+    """A seeded random walk between points in a box; the speed of each leg is drawn from a range.
 
-    The box extends from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``), so
-    the walk can leave the box by about 0.1 m.
+    The box extends from ``low_m`` to ``high_m``. Corners are rounded (the acceleration is at most
+    ``acceleration_m_s2``), so the walk can leave the box by about 0.1 m.
     """
 
     low_m: Vec3
@@ -276,14 +276,14 @@ Path = WaypointPath | CirclePath | OvalPath | LissajousPath | WalkPath | RingWal
 
 @dataclass(frozen=True, slots=True)
 class FixedYaw:
-    """A constant heading."""
+    """A heading that is constant."""
 
     yaw_rad: float
 
 
 @dataclass(frozen=True, slots=True)
 class AlongYaw:
-    """The heading of the motion plus an offset, turning at most as fast as the limit."""
+    """The heading of the motion plus an offset; it turns at most as fast as the limit allows."""
 
     offset_rad: float
     turn_rate_rad_s: float
@@ -291,7 +291,7 @@ class AlongYaw:
 
 @dataclass(frozen=True, slots=True)
 class TowardsYaw:
-    """The heading towards a point on the floor plan, turning at most as fast as the limit."""
+    """The heading towards a point on the floor plan; it turns at most as fast as the limit allows."""
 
     point_m: Vec2
     turn_rate_rad_s: float
@@ -302,7 +302,7 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:
-    """An upright card with a marker that is carried along a path. Drones pass through it.
+    """An upright card with a marker that is carried along a path. Drones can fly through the board.
 
     The path describes the card's centre, and the yaw is the heading of the card's face.
     """
@@ -315,9 +315,9 @@ class BoardTarget:
 
 @dataclass(frozen=True, slots=True)
 class PlatformTarget:
-    """A solid slab with a marker on its top, moving along a path. Drones can land on it.
+    """A solid slab with a marker on top, moving along a path. Drones can land on the platform.
 
-    The path describes the top face's centre, and the top of the marker points along the platform's heading.
+    The path describes the centre of the top face, and the top of the marker points along the platform's heading.
     """
 
     name: str
@@ -328,22 +328,22 @@ class PlatformTarget:
     texture: str = "wood"
 
 
-FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.3, 1.15)}  #: depth, width, height
+FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.3, 1.15)}  #: depth, width and height
 
 
 @dataclass(frozen=True, slots=True)
 class FigureTarget:
     """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
-    The path describes the middle of its footprint (z is the ground below it), and the yaw is its heading.
+    The path describes the centre of its footprint (z is the ground below it), and the yaw is its heading.
     """
 
     name: str
     shape: str  #: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`
     path: Path
     yaw: Yaw
-    size_m: Vec3  #: size along the figure's own x (ahead), y (left) and z
-    #: index that selects the colours and the pattern of the clothes; figures of the same shape and look are look-alikes
+    size_m: Vec3  #: size along the figure's own x (forward), y (left) and z
+    #: index that selects the colours and pattern of the clothes; figures with the same shape and index are look-alikes
     look: int = 0
     colour: Rgb | None = None  #: colour of a person's top or a car's body; None for the look's colour
 
@@ -355,8 +355,8 @@ Target = BoardTarget | PlatformTarget | FigureTarget
 class TargetState:
     """The state of a moving target at a simulation time, in world axes.
 
-    Position [m], yaw [rad, within ±π] and velocity [m/s]. The position of a platform is the centre of its top face,
-    that of a figure is the ground below it. ``walked_m`` is the distance travelled since the start, and
+    Position [m], yaw [rad, within ±π] and velocity [m/s]. The position of a platform is the centre of its top face; the
+    position of a figure is the ground below it. ``walked_m`` is the distance travelled since the start, and
     ``yaw_rate_rad_s`` is the turn rate.
     """
 
@@ -369,7 +369,7 @@ class TargetState:
     yaw_rate_rad_s: float = 0.0
 
     def face(self, target: Target) -> FacePose:
-        """Return the pose of the target's marker at this time."""
+        """Return the pose of the target's marker at the time of this state."""
         if isinstance(target, PlatformTarget):
             # The picture faces up, with its top along the heading; FacePose explains the half turn.
             return FacePose(self.position_m, yaw_rad=self.yaw_rad + math.pi, elevation_rad=math.pi / 2)
@@ -381,7 +381,7 @@ class Wind:
     """Moving air: a mean velocity (the direction it blows towards) and gusts.
 
     Gusts are a first-order Gauss-Markov process per axis. ``gust_m_s`` is the standard deviation along each horizontal
-    axis (half of it vertically).
+    axis; the vertical one is half of it.
     """
 
     mean_m_s: Vec3 = (0.0, 0.0, 0.0)
@@ -391,9 +391,9 @@ class Wind:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Slowly changing daylight, as under passing clouds: between 1 - ``amplitude`` and 1 times the full brightness.
+    """Slowly changing daylight, as if clouds were passing: between 1 - ``amplitude`` and 1 times the full brightness.
 
-    It sums two sines with periods of ``period_s`` and about a third of that, and phases from the world's seed.
+    The light sums two sines with periods of ``period_s`` and about a third of it, and phases from the world's seed.
     """
 
     amplitude: float = 0.0
@@ -420,7 +420,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` determines everything that is random in it (the walks of its targets)."""
+    """A whole world. ``seed`` determines everything in it that is random (the walks of its targets)."""
 
     name: str
     room: Room
@@ -435,12 +435,12 @@ class World:
     light: Light = Light()
 
     def solids(self) -> tuple[Box, ...]:
-        """Return every fixed solid: the boxes, and the gates' bars and legs."""
+        """Return all fixed solids: the boxes, and the bars and legs of the gates."""
         return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())
 
 
 def geometry_of(world: World) -> WorldGeometry:
-    """Return the fixed geometry of a world, without textures and moving objects."""
+    """Return the fixed geometry of a world, without its textures and moving objects."""
     x, y, z = world.room.size_m
     return WorldGeometry(
         name=world.name[:64],
@@ -468,5 +468,5 @@ def geometry_of(world: World) -> WorldGeometry:
 
 
 def _rounded(place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Round to millimetres, to keep the text short."""
+    """Round to millimetres to keep the text short."""
     return round(place[0], 3), round(place[1], 3), round(place[2], 3)

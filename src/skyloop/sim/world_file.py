@@ -1,7 +1,7 @@
 """Worlds in TOML files: the tables with their allowed values, and functions that read them.
 
 Lengths are in metres, speeds in metres per second and angles in **degrees** (with keys that end in ``_deg``), because
-people write these files by hand; degrees are converted to radians only here. The files in ``worlds/`` show every table.
+people write these files by hand; degrees are converted to radians only here. The files in ``worlds/`` use every table.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class WindTable(_Table, kw_only=True):
 
 
 class VariedTable(Named, kw_only=True):
-    """An object, and how far the seed may move it from its position in the file."""
+    """An object, and the maximum distance by which the seed may move it from its position in the file."""
 
     vary: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 0.0, 0.0)
     vary_yaw_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 0.0
@@ -117,7 +117,7 @@ class VariedTable(Named, kw_only=True):
 
 class BoxTable(VariedTable, kw_only=True):
     size: Size
-    stands_at: Spot | None = None  #: position on the floor, the usual case
+    stands_at: Spot | None = None  #: position on the floor (the usual case)
     position: Position | None = None
     yaw_deg: Degrees = 0.0
     texture: Texture = "crate"
@@ -133,7 +133,7 @@ class GateTable(VariedTable, kw_only=True):
 
 
 class FaceTable(Named, kw_only=True):
-    """Position given by two coordinates on a face of the room, or by a point and a heading."""
+    """Position specified by two coordinates on a face of the room, or by a point and a heading."""
 
     on: Mount | None = None
     at: Spot | None = None
@@ -292,13 +292,13 @@ def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
     """Load a world.
 
     Args:
-        name_or_path: A built-in world's name, or a file (any name that ends in ``.toml`` or has a separator).
-        seed: Seed for everything that is random in the world.
+        name_or_path: A built-in world's name, or a file (any name that ends in ``.toml`` or contains a separator).
+        seed: Seed for everything in the world that is random.
 
     Raises:
         UnknownNameError: No built-in world has this name.
         FileFormatError: The file can't be read or understood.
-        UsageError: The seed is not an integer of at least 0.
+        UsageError: The seed is not an integer, or is negative.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
@@ -420,8 +420,8 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
 def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room) -> FacePose:
     """Return the pose of an object on one of the room's faces.
 
-    On a wall, ``along`` is x (north, south) or y (east, west), and ``other`` is the height. On the floor and the
-    ceiling they are x and y, and the top of the image points east.
+    On a wall, ``along`` is x (north, south) or y (east, west) and ``other`` is the height. On the floor and the
+    ceiling, they are x and y, and the top of the image points east.
     """
     half_x, half_y, height = room.size_m[0] / 2, room.size_m[1] / 2, room.size_m[2]
     gap = _WALL_GAP_M
@@ -556,14 +556,14 @@ def _colour(text: str, place: Place) -> Rgb:
     return (int(digits[0:2], 16), int(digits[2:4], 16), int(digits[4:6], 16))
 
 
-_TRIES = 400  # maximum number of tries for the position of one object
-_BEGINNINGS = 100  # maximum number of restarts, because the first objects may leave no room for the last
+_TRIES = 400  # maximum number of attempts to place one object
+_BEGINNINGS = 100  # maximum number of restarts; the objects placed first may leave no room for the last ones
 
 Varied = BoxTable | GateTable | SpawnTable
 
 
 def place_varied(table: WorldTable, seed: int, place: Place) -> None:
-    """Move varied objects to positions determined by the seed, uniformly within their ranges."""
+    """Move varied objects to positions that the seed determines, uniformly distributed within their ranges."""
     things = _varied(table)
     if not things:
         return

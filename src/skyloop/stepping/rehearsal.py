@@ -1,9 +1,9 @@
 """Rehearsals: flights in simulated time, with a clock that stops while the controller computes.
 
 Simulator, driver, proxy and application share this process. Whenever the application waits in :meth:`Controller.run`,
-for the next frame or for a state, time advances to the next event. A one-minute flight therefore takes only as long as
-its computation, a slow machine misses nothing, and the same seeds give the same flight.
-Delay, loss and position noise between proxy and vehicle are simulated.
+for the next frame, or for a state, time advances to the next event. A one-minute flight therefore takes only as long as
+its computation, a slow machine misses nothing, and the same seeds give the same flight. Delay, loss and position noise
+between proxy and vehicle are simulated.
 """
 
 from __future__ import annotations
@@ -75,13 +75,13 @@ def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) ->
 
     Args:
         uri: A ``sim://`` address without ``speed``.
-        radio: The radio link between proxy and vehicle; None uses the defaults.
+        radio: The radio link between proxy and vehicle, or None for the defaults.
 
     Yields:
         The connected drone.
 
     Raises:
-        UsageError: The address is not a ``sim://`` address, or has a ``speed``.
+        UsageError: The address is not a ``sim://`` address, or specifies a ``speed``.
     """
     address = parse_uri(uri)
     if address.scheme != "sim" or "speed" in address.options:
@@ -112,7 +112,7 @@ class _RehearsalDriver(SimDriver):
         self._radio = radio
         self._clock = clock
         self._random = random.Random(f"rehearsal/{radio.seed}")
-        # Cameras use a separate generator, so that they don't change which commands and feedback are lost.
+        # Cameras use a separate generator, so that they do not affect which commands and feedback are lost.
         self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
         self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap ordered by arrival time
         self._numbers = itertools.count()
@@ -127,7 +127,7 @@ class _RehearsalDriver(SimDriver):
         return min(step_ns, self._on_the_way[0][0])
 
     def step(self) -> None:
-        """Do the work that is due, arrivals first."""
+        """Do the work that is due, starting with arrivals."""
         assert isinstance(self.host, SteppedHost)
         if self._on_the_way and self._on_the_way[0][0] <= self._clock.now_ns:
             heapq.heappop(self._on_the_way)[2]()
@@ -200,7 +200,7 @@ class SteppedHost(SimHost):
         return None if self._manual_stepper is None else self._manual_stepper.due_ns
 
     def step(self) -> None:
-        """Advance by one tick."""
+        """Advance the simulation by one tick."""
         if self._manual_stepper is not None:
             self._manual_stepper.step()
 

@@ -2,8 +2,8 @@
 
 Proxy, recording and application share this process, with a clock that stops while the application's code runs. Whenever
 the application waits for a frame, for a state or in :meth:`Controller.run`, the clock advances to the next
-event: a recorded sample, a repeated command or a proxy tick. Each sample is therefore consumed before the next one
-exists, the application sees the recording's times, and two runs of the same controller produce the same commands.
+event: a recorded sample, a repeated command, or a tick of the proxy. Each sample is therefore consumed before the next
+one exists, the application sees the recording's times, and two runs of the same controller produce the same commands.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from skyloop.stepping.transport import StepExecutor, SteppedServer, StepSchedule
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
-LEAD_NS: Final = NS_PER_S  #: time between the clock's start and the recording's: leaves a few ticks to connect
+LEAD_NS: Final = NS_PER_S  #: time between the clock's start and the recording's start, for a few ticks to connect
 
 
 def connector(uri: str) -> SteppedReplay | None:
-    """Create a stepped replay. Entry point ``replay`` in the group ``skyloop.connectors``.
+    """Create a stepped replay. The entry point ``replay`` in the group ``skyloop.connectors``.
 
     Args:
         uri: The address, ``replay://…``.
 
-    Returns: The replay if the address contains ``speed=max``; otherwise None, because a private proxy serves such
-        addresses.
+    Returns:
+        The replay if the address contains ``speed=max``; None for other addresses, which a private proxy serves.
 
     Raises:
         UsageError: The address or the recording is invalid.
@@ -38,7 +38,7 @@ def connector(uri: str) -> SteppedReplay | None:
 
 
 class SteppedReplay:
-    """The proxy of a replay, and the simulated time that it shares with its only application."""
+    """The proxy of a replay, and the simulated time that the proxy shares with its only application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
         """Start the proxy."""

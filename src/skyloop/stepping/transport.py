@@ -38,7 +38,7 @@ _log = logging.getLogger("skyloop")
 
 
 class StepExecutor:
-    """A thread that runs everything except the application's own code, in the order in which it was posted."""
+    """A thread that runs everything except the application's own code, in the order in which it is posted."""
 
     def __init__(self, name: str) -> None:
         """Start the thread."""
@@ -52,13 +52,13 @@ class StepExecutor:
         return threading.current_thread() is self._thread
 
     def post(self, job: Job) -> None:
-        """Queue a job, whose exceptions are logged."""
+        """Queue a job; exceptions that it raises are logged."""
         self._jobs.put(job)
 
     def call(self, job: Job, interrupt: Job) -> None:
-        """Queue a job and wait until it has returned; its exceptions are raised here.
+        """Queue a job and wait until it has returned; exceptions of the job are raised here.
 
-        If Ctrl-C is pressed, this calls ``interrupt`` on this thread to make the job return.
+        If Ctrl-C is pressed, ``interrupt`` is called on this thread to make the job return.
         """
         done = threading.Lock()
         done.acquire()
@@ -108,7 +108,7 @@ class StepExecutor:
 def _run_logged(job: Job) -> None:
     try:
         job()
-    except Exception:  # noqa: BLE001  (the next step may work)
+    except Exception:  # noqa: BLE001 (the next step may succeed)
         _log.exception("a step of a replay failed")
 
 
@@ -190,7 +190,7 @@ class SteppedServer(TransportServer):
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection unless it has ended; each side's handler is called after all earlier packets."""
+        """End a connection that has not ended yet; each side's handler is called after all earlier packets."""
         if self._client is not client:
             return
         self._client = None
@@ -257,12 +257,12 @@ class SteppedClient(TransportClient):
             self._handler.frame(header, pixels)
 
     def ended(self, reason: str) -> None:
-        """Notify the handler, once, that the connection has ended."""
+        """Notify the handler, only once, that the connection has ended."""
         self._handler.closed(reason)
         self._closed.set()
 
 
-AFTER_NS: Final = 60 * NS_PER_S  #: an unlimited wait gives up this long after the end of the recording
+AFTER_NS: Final = 60 * NS_PER_S  #: a wait without a time limit gives up this long after the end of the recording
 _TICK_NS: Final = nanoseconds(PERIOD_S)
 _NEVER_NS: Final = 1 << 62
 
@@ -291,7 +291,7 @@ class StepScheduler(Scheduler):
         source: Callable[[], StepSource | None],
         begin_ns: int,
     ) -> None:
-        """Set up simulated time; ``source`` returns the source of samples or steps, or None if there is none yet."""
+        """Set up simulated time; ``source`` returns the source of samples or steps, or None while there is none."""
         super().__init__(clock)
         self._time = clock
         self._executor = executor
@@ -303,7 +303,7 @@ class StepScheduler(Scheduler):
         self._tick_due_ns = clock.now_ns
         self._begun = False  # whether the application is connected and the recording has started
         self._end_ns = _NEVER_NS
-        self._turn = threading.Lock()  # held by the thread that is advancing time
+        self._turn = threading.Lock()  # held by the thread that is currently advancing time
         self._interrupted = False
 
     def notifier(self) -> Notifier:
@@ -319,16 +319,16 @@ class StepScheduler(Scheduler):
         self._supervisor = supervisor
 
     def opened(self) -> None:
-        """Advance to the recording's start and begin to publish its samples."""
+        """Advance to the recording's start and start publishing its samples."""
         self.wait_for(lambda: False, (self._begin_ns - self._time.now_ns) / NS_PER_S, lambda: False)
         self._begun = True
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None, sleep: Callable[[], bool]) -> bool:
-        """Advance simulated time until ``ready()`` is true, evaluated after each step on the executor's thread.
+        """Advance simulated time until ``ready()`` is true; it is evaluated after each step on the executor's thread.
 
-        If another thread is already advancing time, this one just waits in ``sleep()``, in real time. The limit is in
-        simulated time; None waits until 60 s after the recording's end. On the executor's thread, for example in an
-        inline callback, this raises UsageError.
+        If another thread is already advancing time, the calling thread just waits in ``sleep()``, in real time. The
+        limit is in simulated time; None means wait until 60 s after the end of the recording. On the executor's thread,
+        for example in an inline callback, UsageError is raised.
         """
         if self._executor.is_current:
             raise UsageError("a callback in step with the recording can't wait for the next sample")
@@ -354,7 +354,7 @@ class StepScheduler(Scheduler):
         return True
 
     def _step(self, until_ns: int) -> bool:
-        """Process the next event; return False if there is none or it is due later than the given time."""
+        """Process the next event; return False if there is none, or if it is due later than the given time."""
         supervisor, steps, time = self._supervisor, self._source(), self._time
         if supervisor is not None and (supervisor.connection.poked or self._supervisor_due_ns <= time.now_ns):
             self._attend(supervisor)
@@ -400,7 +400,7 @@ class StepNotifier(Notifier):
         self._scheduler = scheduler
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true, evaluated after each step; return whether it became so in time."""
+        """Wait until ``ready()`` is true; it is evaluated after each step. Return whether it became true in time."""
         return ready() or self._scheduler.wait_for(
             ready, timeout_s, lambda: super(StepNotifier, self).wait_for(ready, timeout_s)
         )

@@ -18,7 +18,7 @@ from skyloop.files import write
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 1120  #: width of all charts that have a time axis; the page scales them
+WIDTH: Final = 1120  #: width of all charts with a time axis; the page scales the charts
 LEFT: Final = 64  #: left margin for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
@@ -29,14 +29,14 @@ GAP_FACTOR: Final = 8.0  #: minimum length of a gap in a line, as a multiple of 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A data series over time, NaN where unknown. ``style`` is the CSS class that sets its colour."""
+    """A data series over time, with NaN where the value is unknown. ``style`` is the CSS class that sets its colour."""
 
     label: str
     t_s: Floats
     values: Floats
     style: str = "c1"
     dashed: bool = False
-    steps: bool = False  #: whether to draw steps, which hold each value until the next one
+    steps: bool = False  #: whether to draw the line as steps, which hold each value until the next one
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: f
 
 
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Return round numbers from low to high, at most ``most`` + 1 of them, spaced 1, 2 or 5 times a power of ten."""
+    """Return at most ``most`` + 1 round numbers from low to high, spaced 1, 2 or 5 times a power of ten."""
     if not high > low:
         return [low]
     raw = (high - low) / most
@@ -98,7 +98,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> tuple[float, float]:
-    """Return vertical limits at least ``least_span`` apart: all known values plus a margin, including 0 if ``zero``."""
+    """Return vertical limits at least ``least_span`` apart: all known values plus a margin, and 0 if ``zero``."""
     known = [values for line in lines if (values := line.values[np.isfinite(line.values)]).size]
     if not known:
         return 0.0, least_span
@@ -113,7 +113,7 @@ def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> t
 
 
 def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, Floats]:
-    """Reduce points to at most two per bucket, its minimum and maximum, so that no peak is lost."""
+    """Reduce points to at most two per bucket (its minimum and maximum), so that no peak is lost."""
     if len(t_s) <= 2 * buckets:
         return t_s, values
     keep: list[int] = []
@@ -127,7 +127,7 @@ def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, F
 
 
 def pieces(t_s: Floats, values: Floats) -> list[tuple[Floats, Floats]]:
-    """Return the stretches of points between gaps and unknown values."""
+    """Return the runs of points between gaps and unknown values."""
     if not len(t_s):
         return []
     steps = np.diff(t_s)
@@ -194,7 +194,7 @@ def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Seq
 
 
 def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) -> str:
-    """Draw a path as seen from above, with equal scales, coloured by time, on a grid in metres."""
+    """Draw a path as seen from above, with equal scales on both axes, coloured by time, on a grid in metres."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y, t_s = x[known], y[known], t_s[known]
     half = max(float(np.ptp(x)), float(np.ptp(y)), 1.0) * 0.56
@@ -321,7 +321,7 @@ class Page:
         )
 
     def way(self, t_s: Floats, x: Floats, y: Floats) -> None:
-        """Show the position on the map at the cursor."""
+        """Show on the map the position at the time of the cursor."""
         step = max(1, len(t_s) // 2000)
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 
@@ -356,13 +356,13 @@ _FILES = ("page.css", "page.js")
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Format figures side by side as HTML."""
+    """Format facts side by side as HTML."""
     cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in pairs)
     return f'<dl class="facts">{cells}</dl>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], classes: Sequence[str]) -> str:
-    """Format a table as HTML. Cells are not escaped; class ``n`` marks a column of numbers."""
+    """Format a table as HTML. Cells are not escaped; class ``n`` marks a column that contains numbers."""
     titles = "".join(f'<th class="{kind}">{escape(title)}</th>' for title, kind in zip(head, classes, strict=True))
     lines = "".join(
         "<tr>" + "".join(f'<td class="{kind}">{cell}</td>' for cell, kind in zip(row, classes, strict=True)) + "</tr>"
@@ -380,5 +380,5 @@ def _legend(lines: Sequence[Line]) -> str:
 
 
 def _numbers(values: Floats) -> list[float | None]:
-    """Round values to the precision that is visible; unknown values become None."""
+    """Round values to a precision that is still visible; unknown values become None."""
     return [round(number, 4) if math.isfinite(number) else None for number in values.tolist()]

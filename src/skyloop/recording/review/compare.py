@@ -1,4 +1,4 @@
-"""Compare the commands of two recordings over time, to show what a changed controller does differently."""
+"""Compare the commands of two recordings over time, to show how a modified controller behaves differently."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.charts import Line, Mark, Page, TimeAxis, band_chart, facts, limits, spans, table
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
-RATE_HZ: Final = 100.0  #: sampling rate of the comparison; a command holds until the next one
-PART: Final = 0.01  #: maximum difference at which two set-points count as equal, in their SI unit
+RATE_HZ: Final = 100.0  #: sampling rate of the comparison; a command remains in effect until the next one
+PART: Final = 0.01  #: maximum difference at which two set-points are considered equal, in their SI unit
 _POSITION: Final = "replay.position_s"
 _UNITS: Final = {
     **dict.fromkeys(("roll", "pitch", "yaw"), "rad"),
@@ -33,14 +33,14 @@ What = Literal["asked", "applied"]
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """The commands of one recording: actions and their values, NaN where an action has no value with that name."""
+    """The commands of one recording: actions and their values, with NaN where an action has no value of that name."""
 
     times_s: NDArray[np.float64]
     names: NDArray[np.str_]
     numbers: dict[str, NDArray[np.float64]]
 
     def at(self, times_s: NDArray[np.float64]) -> Commands:
-        """Return the commands in effect at the given times [s]; there are none before the first."""
+        """Return the commands in effect at the given times [s]; before the first command, there is none."""
         index = np.searchsorted(self.times_s, times_s, side="right") - 1
         before = index < 0
         index = np.maximum(index, 0)
@@ -54,27 +54,27 @@ class Commands:
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
-    """The difference in one set-point value, over the time when both recordings have it."""
+    """The difference in one set-point value, over the time in which both recordings contain the value."""
 
     name: str
     unit: str
     rms: float
     largest: float
     largest_at_s: float
-    seconds: float  #: time during which both recordings have it
+    seconds: float  #: time during which both recordings contain the field
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The commands of two flights on one time axis, which starts with the older recording."""
+    """The commands of two flights on a common time axis, which starts with the older recording."""
 
     aligned: str  #: description of how the times are aligned
     old: Commands
     new: Commands
-    seconds: float  #: duration of the part that is compared
-    same_action: float  #: fraction of that duration with the same kind of action in both
+    seconds: float  #: duration of the part that both recordings share
+    same_action: float  #: fraction of that duration in which both recordings have the same kind of action
     fields: tuple[FieldDifference, ...]
-    part_at_s: float | None  #: first difference, in kind or by more than :data:`PART`; None if there is none
+    part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None if none
     counts: tuple[int, int]
 
 
@@ -86,16 +86,16 @@ def compare(
     what: What = "asked",
     part: float = PART,
 ) -> Comparison:
-    """Compare the commands that applications requested (or those applied), excluding the proxies' own.
+    """Compare the commands that applications requested (or the applied ones), excluding the proxies' own commands.
 
     The times of a recorded replay are mapped to those of the old flight; otherwise the first commands are aligned.
 
     Args:
         old: The older recording.
-        new: The newer one.
-        drone: The drone's name; None selects the first in each recording.
+        new: The newer recording.
+        drone: The drone's name, or None to use the first drone in each recording.
         what: ``"asked"`` or ``"applied"``.
-        part: Maximum difference at which two set-points count as equal, in their SI unit.
+        part: Maximum difference at which two set-points are considered equal, in their SI unit.
 
     Raises:
         FileFormatError: A recording has no commands.
@@ -209,7 +209,7 @@ def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
 
     Raises:
         UsageError: The file can't be written.
-        MissingExtraError: Matplotlib is needed and not installed.
+        MissingExtraError: Matplotlib is required but is not installed.
     """
     if path.suffix == ".png":
         _picture(found, old, new, path)
@@ -218,7 +218,7 @@ def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
 
 
 def make_page(found: Comparison, old: str, new: str) -> Page:
-    """Create the page: actions, each set-point from both recordings, and a table of differences."""
+    """Create the page: the actions, each set-point from both recordings, and a table of differences."""
     axis = _axis(found)
     page = Page(f"{new} against {old}", axis)
     page.add(f"<h1>{escape(Path(new).name)} against {escape(Path(old).name)}</h1>")

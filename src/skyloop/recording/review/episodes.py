@@ -1,6 +1,6 @@
-"""Convert recorded flights to episodes for learning: rows at a steady rate, each with an observation and an action.
+"""Convert recorded flights to episodes for learning: rows at a constant rate, each with an observation and an action.
 
-Everything except the video is computed from a recording's tables.
+Everything except the video is computed from the recording's tables.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import Table
 from skyloop.recording.review.video import even
 
-MARK: Final = "mark"  #: name of a logged text that starts a new episode and names its task
-TAUGHT: Final = "action"  #: name of logged arrays that hold the demonstrated action for an image
+MARK: Final = "mark"  #: name of the logged text that starts a new episode and names its task
+TAUGHT: Final = "action"  #: name of the logged arrays that hold the demonstrated action for an image
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
-_GAP_S: Final = 0.5  #: time without an image or state after which an episode ends
+_GAP_S: Final = 0.5  #: an episode ends after this time without an image or state
 _SHORTEST_S: Final = 1.0  # minimum duration of an episode; shorter ones are skipped
 
 Floats = NDArray[np.float64]
@@ -38,26 +38,26 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """Defines the columns of each row."""
+    """Defines the columns that each row has."""
 
-    state: tuple[str, ...]  #: names of the numbers in the state, from :data:`~skyloop.messages.rows.STATE`
+    state: tuple[str, ...]  #: names of the values in the state, from :data:`~skyloop.messages.rows.STATE`
     set_point: str  #: kind of commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`
     cameras: tuple[str, ...]  #: cameras whose images each row includes
     fps: float  #: rows per second
 
     @property
     def action(self) -> tuple[str, ...]:
-        """Names of the numbers in the action."""
+        """Names of the values in the action."""
         return ACTIONS[self.set_point]
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One flight, or a part of one marked by the application."""
+    """One flight, or a part of a flight that the application has marked."""
 
     task: str  #: description of the task
     state: Floats  #: state when the first camera's image was captured, shape (rows, len(form.state)), float64
-    #: action demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64
+    #: action that was demonstrated, or commanded by the time of the next row, shape (rows, len(form.action)), float64
     action: Floats
     frames_ns: Mapping[str, Times]  #: capture time of each row's image by camera, on the proxy's clock, shape (rows,)
 
@@ -67,10 +67,10 @@ class Episode:
 
 
 def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
-    """Return the columns that every row of a recording can have.
+    """Return the columns available in every row of a recording.
 
-    Raise ``FileFormatError`` if the recording has no feedback, no set-points, or no frames of a camera, or
-    ``UsageError`` if it was flown with several kinds of set-points, or with positions.
+    Raise ``FileFormatError`` if the recording has no feedback, no set-points, or no frames of a camera, and
+    ``UsageError`` if it was flown with positions or several kinds of set-points.
     """
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
@@ -94,13 +94,13 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
 def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode]:
     """Cut a recording into episodes.
 
-    An episode lasts while the drone follows set-points without a gap in images or state, and is cut at marks. Its rows
-    are ``1 / form.fps`` apart. Each contains the newest image from every camera, the state at the first camera's
-    capture time, and the set-point in effect when the next row begins, which is the reaction to that image. Hovering
-    counts as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
-    instead: each row has the first one at or after its image's capture, and a gap in them ends an episode. ``task``:
-    name of the task where no mark gives one. Return the episodes that last at least a second. Raise ``FileFormatError``
-    if a logged action has a different number of values than the form's set-points.
+    An episode lasts while the drone follows set-points without a gap in its images or state. Marks split episodes. Its
+    rows are ``1 / form.fps`` apart. Each contains the newest image from every camera, the state at the first camera's
+    capture time, and the set-point in effect when the next row begins, which is the response to that image. Hovering is
+    stored as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
+    instead: each row has the first of these actions at or after its image's capture, and a gap in them ends an episode.
+    ``task``: name of the task where no mark names one. Return the episodes that last at least a second. Raise
+    ``FileFormatError`` if the number of values of a logged action differs from that of the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -137,7 +137,7 @@ def _times(table: Table, column: str) -> Times:
 
 
 def _piloted(commands: Table) -> NDArray[np.bool_]:
-    """Return which commands came from an application rather than from the proxy."""
+    """Return which commands were sent by an application rather than by the proxy."""
     given: NDArray[np.bool_] = commands.numbers("app_id") > 0
     return given
 
@@ -161,12 +161,12 @@ def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
 
 
 def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, int, str]]:
-    """Return start [ns], end [ns] and task of each stretch in which the drone follows set-points, cut at marks."""
+    """Return the start [ns], end [ns] and task of each period in which the drone follows set-points, split at marks."""
     times, steered = _times(feedback, "captured_ns"), np.isin(feedback["state"], _STEERED)
     marks: list[tuple[int, str]] = []
     if logs is not None and "text" in logs.columns:
         marked = (logs["name"] == MARK) & (logs["text"] != "")
-        # Times in a table are relative, and a mark is stored where it was received, between two states.
+        # Times in a table are relative, and a mark is stored at the time it was received, between two states.
         for t_s, text in zip(logs.numbers("t_s")[marked], logs["text"][marked], strict=True):
             marks.append((int(np.interp(t_s, feedback.numbers("t_s"), times)), str(text)))
     parts = []
@@ -185,7 +185,7 @@ def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, in
 
 
 def _runs(good: NDArray[np.bool_]) -> list[slice]:
-    """Return the stretches of consecutive true values."""
+    """Return the runs of consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(np.int8)))
     return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -204,7 +204,7 @@ def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
 
 
 def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
-    """Return the set-point in effect at the given times; zeros before the first one and while hovering."""
+    """Return the set-point in effect at the given times, or zeros before the first set-point and while hovering."""
     kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
     times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]
     values = np.stack([np.nan_to_num(commands.numbers(f"asked_{name}")[kept]) for name in form.action], axis=1)
@@ -219,8 +219,8 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in any order
-_LOOKED_AT_EVERY: Final = 16  #: number of rows of which one is sampled for the statistics
+_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in random order
+_LOOKED_AT_EVERY: Final = 16  #: interval, in rows, between the rows sampled for the statistics
 _THINNED: Final = 4  #: spacing of the rows and columns used from a sampled image
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
@@ -228,10 +228,10 @@ Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """An H.264 MP4 file with one camera's images from all episodes at a steady rate. An error removes it."""
+    """An H.264 MP4 file with one camera's images from all episodes at a fixed rate. It is deleted after an error."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        #: number of rows that repeat the previous image because theirs could not be decoded
+        #: number of rows that repeat the previous image because their own image could not be decoded
         self.width = self.height = self.repeated = 0
         self._path, self._fps = path, Fraction(fps).limit_denominator(1000)
         self._opened = ExitStack()
@@ -259,10 +259,10 @@ class Film:
         self._opened.__exit__(kind, error, trace)
 
     def add(self, recording: Recording, drone: str, camera: str, wanted_ns: Sequence[Times]) -> None:
-        """Encode the images for a recording's rows, given by their capture times, episode by episode.
+        """Encode the images for the rows of a recording, selected by capture time, episode by episode.
 
-        Raise ``FileFormatError`` if the first image can't be decoded, or ``UsageError`` if an image differs in size
-        from the first.
+        Raise ``FileFormatError`` if the first image can't be decoded, and ``UsageError`` if an image differs in size
+        from the first one.
         """
         wanted = np.concatenate([np.empty(0, np.int64), *wanted_ns])
         at = 0
@@ -289,7 +289,7 @@ class Film:
             self._encode(image, recording.path)
 
     def stats(self) -> dict[str, Any]:
-        """Return minimum, maximum, mean, deviation and quantiles of the red, green and blue channels, 0 to 1."""
+        """Return the minimum, maximum, mean, deviation and quantiles of the red, green and blue channels, 0 to 1."""
         pixels = np.concatenate([image.reshape(-1, 3) for image in self._looked_at])[:, ::-1] / 255.0
         found = numbers_stats(pixels)
         return {name: [self._rows] if name == "count" else [[[v]] for v in value] for name, value in found.items()}

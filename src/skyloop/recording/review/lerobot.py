@@ -49,10 +49,10 @@ class Exported:
     form: Form
     episodes: int
     rows: int
-    repeated: int  #: number of images that could not be decoded and repeat the previous one
+    repeated: int  #: number of rows whose image could not be decoded, so they repeat the previous image
 
 
-#: A recording, the drone flown, and its episodes.
+#: A recording, the drone that was flown, and its episodes.
 _Flight = tuple[Recording, str, list[Episode]]
 
 
@@ -68,23 +68,23 @@ def export_lerobot(
 ) -> Exported:
     """Export flights as episodes of a LeRobotDataset.
 
-    An episode lasts while the drone follows set-points; a logged text named ``mark`` starts a new one and names its
+    An episode lasts while the drone follows set-points; a logged text named ``mark`` starts a new episode and names its
     task. :func:`skyloop.recording.review.episodes.episodes` describes the rows.
 
     Args:
         recordings: Recordings of similar drones flown in the same way.
         folder: Folder for the dataset; it must be new or empty.
-        drone: The drone's name in each recording; None selects the first in each.
-        cameras: Cameras to export; None selects all cameras of the first recording.
+        drone: The drone's name in each recording, or None to use the first drone in each.
+        cameras: Cameras to export, or None for all cameras of the first recording.
         fps: Rows per second.
-        task: Name of the task where no mark gives one.
-        doing: Called to report progress.
+        task: Name of the task where no mark names one.
+        doing: Called to report the progress.
 
     Raises:
         UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of
             range.
         UnknownNameError: A recording has no such drone.
-        FileFormatError: A recording has no feedback, set-points or frames, or no recording has an episode.
+        FileFormatError: A recording has no feedback, set-points or frames, or no recording contains an episode.
         MissingExtraError: PyArrow, PyAV or OpenCV is not installed.
     """
     doing = doing or (lambda *_: None)
@@ -168,7 +168,7 @@ def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[st
 
 
 def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
-    """Return each episode's rows and its part of each video."""
+    """Return the rows of each episode and its part of each video."""
     ends = np.cumsum([len(episode) for episode in whole])
     begins = ends - [len(episode) for episode in whole]
     zeros = np.zeros(len(whole), np.int64)

@@ -38,12 +38,12 @@ _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
 _MOST_EVENTS: Final = 500  # maximum number of events listed on the page
-_LONGEST_STEP_S: Final = 0.5  #: longest step across which velocity is integrated
+_LONGEST_STEP_S: Final = 0.5  #: longest step over which velocity is integrated
 _WIDTH: Final = 360  #: width of a thumbnail [px]
 _QUALITY: Final = 80  # JPEG quality of thumbnails
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: fraction of the usual spacing; an evenly spaced frame this close to one at an event is skipped
-_SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer ones are skipped, because the two clocks must be unrelated
+_NEAR: Final = 0.4  #: fraction of the usual spacing; an evenly spaced frame this close to an event's frame is skipped
+_SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer delays are skipped, because the two clocks must then be unrelated
 
 
 def write_report(
@@ -143,7 +143,7 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
 def _charts(
     recording: Recording, drone: str, found: dict[str, Table]
 ) -> Iterator[tuple[str, str, list[Line], float, bool]]:
-    """Yield title, unit, lines, minimum span of the vertical axis, and whether that axis includes 0."""
+    """Yield the title, unit, lines, minimum span of the vertical axis, and whether that axis includes 0."""
     feedback, commands = found.get("feedback"), found.get("commands")
     if feedback is not None:
         t_s = feedback.numbers("t_s")
@@ -179,7 +179,7 @@ def _charts(
 
 
 def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool = False) -> list[Line]:
-    """Return the applied values of all set-points that have any."""
+    """Return the applied values of all set-points that have values."""
     if commands is None:
         return []
     found = []
@@ -192,14 +192,14 @@ def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool =
 
 
 def _turned(yaw: Floats) -> Floats:
-    """Convert yaw to degrees, leaving a gap where it wraps around."""
+    """Convert yaw to degrees and leave a gap where it wraps around."""
     degrees = np.degrees(yaw)
     jumps = np.abs(np.diff(degrees, prepend=degrees[:1])) > 180.0
     return np.where(jumps, np.nan, degrees)
 
 
 def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterator[Line]:
-    """Yield the delays [ms] of samples from capture to recorder, and of commands from sending to applying."""
+    """Yield the delays [ms] of samples from capture to recorder, and of commands from sending to execution."""
     offset_ns = recording.drone(drone).clock_offset_ns
     colours = iter(_COLOURS)
     for name, samples in found.items():
@@ -216,14 +216,14 @@ def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterat
 
 
 def _clipped(line: Line) -> Line:
-    """Clip a line at its 99.5th percentile, so that one late sample does not flatten all others."""
+    """Clip a line at its 99.5th percentile, so that a single late sample does not flatten the rest of the line."""
     if not len(line.values):
         return line
     return Line(line.label, line.t_s, np.minimum(line.values, np.percentile(line.values, 99.5) * 1.05), line.style)
 
 
 def _logged(logs: Table | None) -> Iterator[Line]:
-    """Yield the logged series of numbers, at most six."""
+    """Yield up to six logged series of numbers."""
     if logs is None or "number" not in logs.columns:
         return
     numbers = logs.numbers("number")
@@ -302,7 +302,7 @@ class Way:
 def way_of(feedback: Table) -> Way | None:
     """Return the drone's path, or None if it is unknown.
 
-    Uses the vehicle's own position or, failing that, the simulator's true one or the integrated velocity.
+    Uses the vehicle's own position or, if that is missing, the simulator's true position or the integrated velocity.
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
@@ -340,7 +340,7 @@ def airborne_s(feedback: Table) -> float:
 def flight_facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """Return the known figures for a report's header, as names and values."""
+    """Return the known facts for a report's header, as names and values."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
@@ -367,7 +367,7 @@ def flight_facts(
 
 
 def moments(first_s: float, last_s: float, events: Table | None, most: int) -> list[tuple[float, str]]:
-    """Select times to show, sorted, each with its reason: up to half at events, the rest evenly spaced. Pure."""
+    """Select the times to show, sorted, each with its reason: up to half at events, the rest evenly spaced. Pure."""
     if most < 1 or last_s < first_s:
         return []
     chosen: list[tuple[float, str]] = []
@@ -389,7 +389,7 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
 
 
 def figures(recording: Recording, drone: str, camera: str, frames: Table, events: Table | None, most: int) -> list[str]:
-    """Return thumbnails as HTML, each showing the first frame at or after its moment."""
+    """Return thumbnails as HTML; each shows the first frame at or after its moment."""
     t_s, seq = frames.numbers("t_s"), frames["seq"]
     wanted: dict[int, tuple[float, str]] = {}
     for moment, why in moments(float(t_s[0]), float(t_s[-1]), events, most):
@@ -418,7 +418,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    It has full size if it can't be scaled here, and is empty if damaged or if it is H.264 that can't be decoded here.
+    The image has full size if it can't be scaled here. It is empty if damaged or H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

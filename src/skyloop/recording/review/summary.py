@@ -20,13 +20,13 @@ from skyloop.recording.scan import Message, Scan, Schema, attachments, open_file
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-GAP_FACTOR: Final = 3.0  #: minimum length of a gap between two messages, as a multiple of the typical step
-MIN_STEPS: Final = 5  #: number of steps needed to determine the typical step
+GAP_FACTOR: Final = 3.0  #: minimum length of a gap between two messages, as a multiple of the usual step
+MIN_STEPS: Final = 5  #: minimum number of steps for determining the typical step
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """Statistics on the time between two timestamps of a sample [s]."""
+    """Statistics of the time between two timestamps of a sample [s]."""
 
     what: str  #: names of the two timestamps
     median_s: float
@@ -40,12 +40,12 @@ class Row:
     topic: str
     schema: str
     count: int
-    rate_hz: float | None  #: None if there is only one message, or if all have the same time
-    gaps: int  #: number of steps longer than three typical ones, in steady channels only
+    rate_hz: float | None  #: None if there is only one message, or if all messages have the same time
+    gaps: int  #: number of steps longer than three typical steps, in steady channels only
     longest_s: float | None  #: longest step between two messages [s]
     missing: int  #: messages missing according to gaps in the samples' sequence numbers
     bytes: int
-    steady: bool  #: whether messages arrive at a steady rate, so that rate and gaps are meaningful
+    steady: bool  #: whether messages arrive at a steady rate; otherwise rate and gaps have no meaning
     delays: tuple[Delay, ...] = ()
 
 
@@ -79,7 +79,7 @@ _STEADY: Final = frozenset({Channel.FEEDBACK, Channel.COMMANDS, Channel.FRAMES})
 
 
 def summarise(recording: Recording, progress: Progress | None = None) -> Summary:
-    """Compute the statistics of a recording, reading it once from start to end."""
+    """Compute the statistics of a recording in one pass from start to end."""
     series = {one.topic: one for one in recording.series}
     tallies: dict[str, _Tally] = {topic: _Tally() for topic in series}
     severities: dict[str, int] = {}
@@ -179,21 +179,21 @@ class Recovered:
     messages: dict[str, int]  #: number of messages by topic
     seconds: float
     size: int  #: size of the new file [bytes]
-    lost: int  #: upper limit for the number of bytes in the old file that could not be read
+    lost: int  #: upper limit for the number of unreadable bytes in the old file
     why: tuple[str, ...]  #: problems with the old file
 
 
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
     """Read every byte of a recording and describe its problems; return nothing if it is intact."""
     for _ in recording.entries(progress=progress):
-        pass  # reading is enough: it verifies the checksums
+        pass  # reading is enough, because it verifies the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 
 def recover(recording: Recording, target: Path, progress: Progress | None = None) -> Recovered:
     """Write everything that is readable to a new file, which appears only once it is complete.
 
-    Raise ``UsageError`` if ``target`` already exists, or can't be written.
+    Raise ``UsageError`` if ``target`` already exists or can't be written.
     """
     from mcap.writer import CompressionType, Writer
 
@@ -209,7 +209,7 @@ def recover(recording: Recording, target: Path, progress: Progress | None = None
 
 
 def _copy(found: Scan, writer: Writer, progress: Progress | None) -> tuple[dict[str, int], int]:
-    """Return the number of messages by topic, and the bytes in pieces that were read completely."""
+    """Return the number of messages by topic, and the number of bytes in fully read pieces."""
     writer.start(PROFILE, "skyloop log recover")
     for record in found.metadata:
         writer.add_metadata(record.name, record.metadata)

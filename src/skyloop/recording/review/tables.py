@@ -1,4 +1,4 @@
-"""Convert one drone's samples to columns, the basis of reports and comparisons, and export them to files."""
+"""Convert one drone's samples to columns, which are the basis of reports and comparisons, and export them to files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ACTION_FIELDS: Final = (
     *("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate"),
     *("x", "y", "z", "yaw", "speed", "turn_rate"),
 )
-_ABSURD: Final = 1e30  #: maximum value in any unit: sums of many squared values must not overflow
+_ABSURD: Final = 1e30  #: maximum value in any unit, so that sums of many squared values do not overflow
 Cell = float | int | str | bool | None
 
 
@@ -75,7 +75,7 @@ class Table:
 
 
 class _Builder:
-    """Collects rows whose columns are discovered as they arrive."""
+    """Collects rows whose columns are not known until they arrive."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -98,7 +98,7 @@ class _Builder:
 
 
 def _array(cells: list[Cell]) -> NDArray[Any]:
-    """Convert cells to integers if they all are, to floats if they are all numbers, otherwise to strings."""
+    """Convert cells to integers if all of them are, to floats if all are numbers, and otherwise to strings."""
     kinds = {type(cell) for cell in cells}
     if kinds <= {int}:
         return np.array(cells, np.int64)
@@ -131,9 +131,9 @@ def tables(
 def timed(
     recording: Recording, drone: str, channels: Collection[Channel], progress: Progress | None = None
 ) -> Iterator[tuple[Item, int, int]]:
-    """Yield samples with their own time and that of the recording's first sample, both on the proxy's clock [ns].
+    """Yield samples with their own time and the time of the recording's first sample, both on the proxy's clock [ns].
 
-    The first sample is determined over all channels, so that tables from several calls have the same start.
+    The first sample is determined across all channels, so that tables from several calls have the same start.
     """
     first_ns = begin_ns(recording, drone)
     course = Course()
@@ -142,7 +142,7 @@ def timed(
 
 
 def begin_ns(recording: Recording, drone: str) -> int:
-    """Return the time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
+    """Return the time of the first sample that has a time, on the proxy's clock [ns]; 0 if no sample has one."""
     course = Course()
     for item in recording.items(drone):
         course.follow(item.value)
@@ -241,8 +241,8 @@ _NUMBERS: Final = re.compile(rf"{_NUMBER}(?: {_NUMBER})*")
 def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
     """Write ``CHANNEL.csv`` for each table: UTF-8, comma-separated, with a header line; unknown values are empty.
 
-    Text that a spreadsheet would take for a formula gets a leading apostrophe, because it may have been chosen by an
-    application or by the author of the file.
+    Text that a spreadsheet would interpret as a formula gets a leading apostrophe, because an application or the author
+    of the file may have chosen the text.
     """
     _make_folder(folder)
     written = []
@@ -276,7 +276,7 @@ def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
-    """Write a compressed ``.npz`` (a suffix added to the path) with an array ``CHANNEL/COLUMN`` for each column."""
+    """Write a compressed ``.npz`` (a suffix added to the path) with an array ``CHANNEL/COLUMN`` per column."""
     arrays = {f"{name}/{column}": values for name, table in found.items() for column, values in table.columns.items()}
     path = path if path.suffix == ".npz" else path.with_suffix(".npz")
     with replacing(path) as part:

@@ -1,4 +1,4 @@
-"""Export a camera's frames to MP4. H.264 is copied as recorded; anything else is encoded."""
+"""Export a camera's frames to MP4. H.264 is copied as recorded; all other images are encoded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
 _TIME_BASE: Final = Fraction(1, 60_000)  #: unit that gives each image its own timestamp; MPEG-4 allows at most 65535
-_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: codecs by preference; the first that PyAV has is used
+_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: codecs by preference; the first one that PyAV has is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Videos:
     """The result of an export."""
 
     videos: tuple[Video, ...]
-    left_out: int  #: frames that are damaged, depend on missing ones, or (when encoding) differ in size
+    left_out: int  #: number of frames that are damaged, depend on missing frames, or (when encoding) differ in size
 
     @property
     def frames(self) -> int:
@@ -54,8 +54,8 @@ def export_mp4(
     """Write one camera's frames as a video with their capture times.
 
     H.264 is copied as recorded, without decoding, if nothing is drawn on the frames. If its size or another parameter
-    changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing ones are left out.
-    Everything else is encoded into one file, leaving out damaged frames and those whose size differs from the first.
+    changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing frames are omitted.
+    All other images are encoded into one file, omitting damaged frames and frames that differ in size from the first.
 
     Args:
         recording: The recording.
@@ -73,7 +73,7 @@ def export_mp4(
         UsageError: The file can't be written.
     """
     require_pyav("exporting MP4")
-    recording.pictures(drone, camera)  # raises if a name is unknown
+    recording.pictures(drone, camera)  # raises an error if a name is unknown
     if burn_time or encode or has_images(recording, drone, camera):
         return _encoded(recording, drone, camera, path, burn_time, progress)
     return _copied(recording, drone, camera, path, progress)
@@ -108,7 +108,7 @@ def _encoded(
 
     begin = begin_ns(recording, drone) if burn_time else None
     left_out = 0
-    # PyAV would open the file only at the first frame, and raise exceptions of its own.
+    # PyAV would not open the file until the first frame, and would raise its own exceptions.
     with replacing(path) as part:
         with part.open("wb") as file, av.open(file, "w", format="mp4") as container:
             encoder = _Encoder(container, begin)
@@ -121,12 +121,12 @@ def _encoded(
 
 
 def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Decode frames; yield the capture time [ns] and the image, or None if it can't be decoded."""
+    """Decode frames; yield each capture time [ns] with the image, or with None if the frame can't be decoded."""
     for picture in pictures:
         try:
             image = even(picture.pixels())
         except FileFormatError:
-            image = None  # skip a damaged frame; the others keep their timestamps
+            image = None  # skip a damaged frame; the other frames keep their timestamps
         yield picture.header.captured_ns, image
 
 
@@ -142,7 +142,7 @@ class _Encoder:
         self._frames = 0
 
     def add(self, image: NDArray[np.uint8], captured_ns: int) -> bool:
-        """Encode a frame, or skip it and return False if its size differs."""
+        """Encode a frame; if its size differs, skip it and return False."""
         import av
 
         if self._stream is None:
@@ -211,10 +211,10 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 # Copying --------------------------------------------------------------------------------------------------------
 
 
-TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual one for video
+TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files; the one commonly used for video
 MAX_FILES: Final = 50  #: maximum number of files; a stream that would need more is encoded instead
-_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames: 31 bits hold less than seven hours
-_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration given to the last image
+_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames; 31 bits hold less than seven hours
+_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration assigned to the last image
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +223,7 @@ class Video:
 
     path: Path
     frames: int
-    begin_s: float  #: capture time of its first frame, relative to the first video's
+    begin_s: float  #: capture time of the video's first frame, relative to that of the first video
     width: int
     height: int
     copied: bool  #: whether the frames are in the vehicle's own encoding
@@ -233,7 +233,7 @@ class Video:
 class Contents:
     """The contents of an access unit."""
 
-    parameters: bytes  #: sequence and picture parameter sets in Annex B format; empty unless it has both
+    parameters: bytes  #: sequence and picture parameter sets in Annex B format; empty unless both are present
     is_picture: bool  #: whether it contains a slice of a picture
 
 
@@ -255,11 +255,11 @@ class TooManyChangesError(FileFormatError):
 
 
 class StreamCopy:
-    """Copies one camera's frames, passed in order, to a video, and starts a new one when the stream changes.
+    """Copies one camera's frames to a video in the order given, and starts a new video when the stream changes.
 
-    The stream changes when its parameter sets do: an MP4 file has only one set, at its start. A frame that can't be
-    decoded and all frames up to the next key frame are left out; the frame before them stays on screen until then.
-    ``opened``: closes the files, which get their final names only at that point.
+    The stream changes when its parameter sets change, because an MP4 file has only one set, at its start. A frame that
+    can't be decoded is left out, together with all frames up to the next key frame; the frame before them stays on
+    screen until then. ``opened``: closes the files, which receive their final names only at that point.
     """
 
     def __init__(self, path: Path, opened: ExitStack) -> None:
@@ -272,9 +272,9 @@ class StreamCopy:
         self._first_ns = 0
 
     def add(self, picture: Picture) -> None:
-        """Copy a frame, or skip it.
+        """Copy a frame or skip it.
 
-        Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, or ``OSError`` if the
+        Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, and ``OSError`` if the
         file can't be written.
         """
         file = self._file_for(picture)
@@ -334,10 +334,10 @@ class _Template:
 
 
 def _template(key: bytes) -> _Template | None:
-    """Have FFmpeg read the parameter sets of a key frame; return None if it can't."""
+    """Let FFmpeg read the parameter sets of a key frame; return None if it can't."""
     import av
 
-    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # so that a corrupted size can't make it allocate gigabytes
+    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # prevents a corrupted size from allocating gigabytes
     try:
         container = av.open(BytesIO(key), format="h264", stream_options=limits)
     except (av.error.FFmpegError, ValueError):
@@ -362,7 +362,7 @@ class _File:
         self.parameters = parameters
         self.width, self.height = template.width, template.height
         self.frames = 0
-        # PyAV would open the file only at the first frame, and raise exceptions of its own.
+        # PyAV would not open the file until the first frame, and would raise its own exceptions.
         self._target = opened.enter_context(part.open("wb"))
         self._container: Any = opened.enter_context(av.open(self._target, "w", format="mp4"))
         self._stream = self._container.add_stream_from_template(template.stream)
@@ -372,7 +372,7 @@ class _File:
         self._shortened = 0
 
     def write(self, unit: bytes, captured_ns: int, *, key: bool) -> None:
-        """Append a frame. If its time is not later than the previous one's, use the next possible time."""
+        """Append a frame. If its time is not later than that of the previous frame, use the next possible time."""
         import av
 
         packet: Any = av.Packet(unit)
@@ -382,7 +382,7 @@ class _File:
             self._shortened += stamp - self._stamp - _LONGEST_STEP
             stamp = self._stamp + _LONGEST_STEP
         packet.pts = packet.dts = self._stamp = stamp
-        packet.duration = _USUAL_STEP  # used only for the last frame: the others end when the next one starts
+        packet.duration = _USUAL_STEP  # used only for the last frame; others end when the next one starts
         packet.time_base, packet.stream, packet.is_keyframe = TIME_BASE, self._stream, key
         self._container.mux(packet)
         self.frames += 1

@@ -1,7 +1,7 @@
-"""Drawing with the ``kernels``, compiled by Numba if it is installed: the same images, several times faster.
+"""Drawing with the ``kernels``, compiled by Numba if it is installed: the same images, but several times faster.
 
-Importing Numba takes almost a second, and the first compilation takes longer; from then on the machine code is in
-Numba's cache on disk. No image has to wait for either: both happen on a separate thread.
+Importing Numba takes almost a second, and the first compilation takes longer; from then on, the machine code is in
+Numba's cache on disk. No image has to wait for either of these, because both happen on a separate thread.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with the functions of ``kernels``. See :class:`Painter`."""
+    """Draws with the functions from ``kernels``. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
@@ -62,7 +62,7 @@ class CompiledPainter(Painter):
     ) -> None:
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
-        if self._fixed is None or self._fixed[0] is not quads.texture:  # constant while parts move
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # these do not change while parts move
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
             origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
             self._fixed = quads.texture, weight, origin
@@ -115,12 +115,12 @@ class CompiledPainter(Painter):
 
 
 def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
-    """Return the number of grid rows needed for each row of the image, and how many of the last ones to keep."""
+    """Return the number of grid rows needed for each image row, and how many of the last grid rows to keep."""
     height, width = raster.rays.x.shape
     row = raster.lookup.reshape(height, width) // raster.grid.width
-    # Include the row below, whose samples are needed and have to be compared with those above.
+    # Include the row below, whose samples are needed and must be compared with those above.
     rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
-    at_once = -(-kernels.BLOCK // width) + 1  # rows of the image
+    at_once = -(-kernels.BLOCK // width) + 1  # number of image rows
     first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]
     bands = -(-rows_for // kernels.BAND) * kernels.BAND
     needed = max(bands[min(start + at_once, height) - 1] - first[start] for start in range(height))
@@ -130,13 +130,13 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
 class Compiler:
     """Compiles the kernels once for this process, on a separate thread.
 
-    When the process ends, it waits only for the function being compiled at that moment, not for all of them, because
-    LLVM must not be torn down while it works. ``load`` returns kernels that compile on their first call; it raises
-    ``ImportError`` without Numba.
+    When the process ends, it waits only for the function that is being compiled at that moment, not for all functions;
+    LLVM must not be torn down while it is working. ``load`` returns kernels that are compiled on their first call;
+    without Numba, it raises ``ImportError``.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
-        self.kernels: Kernels | None = None  #: None until compiled
+        self.kernels: Kernels | None = None  #: None until compilation finishes
         self.problem = ""  #: reason why there are no kernels; empty while unknown
         self._load = load or load_kernels
         self._lock = threading.Lock()
@@ -144,7 +144,7 @@ class Compiler:
         self._thread: threading.Thread | None = None
 
     def start(self) -> threading.Thread:
-        """Start compiling unless this has already happened; return the compiling thread."""
+        """Start compiling unless compilation has already been started; return the compiling thread."""
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
@@ -153,7 +153,7 @@ class Compiler:
             return self._thread
 
     def _hold(self, process: int) -> None:
-        """Block further compilation permanently, because after a fork neither the thread nor a usable lock exists."""
+        """Block further compilation permanently: after a fork, neither the thread nor a usable lock exists."""
         if process == os.getpid():
             self._compiling.acquire()
 
@@ -164,7 +164,7 @@ class Compiler:
             self.kernels = functions
         except ImportError as error:
             self.problem = f"Numba is not installed: {error}"
-        except Exception as error:  # noqa: BLE001  compilers raise all kinds of errors, and drawing works without one
+        except Exception as error:  # noqa: BLE001 compilers raise all kinds of errors; drawing works without one
             self.problem = f"Numba can't compile here: {(str(error) or repr(error)).splitlines()[0]}"
             _log.warning("pictures are drawn without compiled code, which takes several times longer: %s", self.problem)
 
@@ -179,7 +179,7 @@ class Compiler:
 def load_kernels() -> Kernels:
     """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
-    RuntimeError if Numba's cache is not writable, because every start would then spend seconds compiling.
+    Raise RuntimeError if Numba's cache is not writable, because every start would then spend seconds compiling.
     """
     import numba
 

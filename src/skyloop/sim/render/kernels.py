@@ -1,12 +1,12 @@
-"""The planar renderer's loops over quads and pixels, in a form that Numba can compile (``compiled``).
+"""The planar renderer's loops over quads and pixels, written so that Numba can compile them (``compiled``).
 
-The loops compute the same as ``shading``, operation by operation in the same order and precision, so
-the image is identical bit by bit; that module explains the mathematics. They also run uncompiled, slowly, for tests
-without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
-hold the interpreter lock.
+The loops compute the same as ``shading``, operation by operation in the same order and precision, so the image is
+bit-identical; that module explains the mathematics. They also run uncompiled, though slowly, for tests without Numba.
+Each kernel is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't hold
+the interpreter lock.
 
-Inner loops are short, write one array each and stay in single precision, because otherwise they would not be
-vectorised. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
+Inner loops are short, write one array each and stay in single precision; otherwise they would not be vectorised.
+Constants from other modules are arguments, because Numba's cache checks only this file for changes.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     Singles = NDArray[np.float32]
     Shorts = NDArray[np.int16]
 
-BLOCK = 512  # pixels per batch: few enough for the working arrays to stay in the cache
-BAND = 16  # grid rows per batch, for the same reason
-FEW = 8  # grid rows compared at a time
-NUMBER = 0x7FFF  # the bits of a sample's number; the sign marks a different sample nearby
-_ROUND = np.float32(3 << 22)  # adding and subtracting this rounds a number up to 2^22 to an integer, halves to even
+BLOCK = 512  # pixels per batch: small enough for the working arrays to stay in the cache
+BAND = 16  # grid rows per batch; small for the same reason
+FEW = 8  # number of grid rows compared at a time
+NUMBER = 0x7FFF  # bit mask of a sample's number; the sign bit marks a different sample nearby
+_ROUND = np.float32(3 << 22)  # adding and subtracting this rounds a number up to 2^22 to an integer; halves go to even
 
 
 def prepare(
-    vectors: Floats,  # see ``Quads``, which also describes the next three
+    vectors: Floats,  # see ``Quads``, which also describes the next three arguments
     starts: Floats,  # see ``Quads``
     two_sided: NDArray[np.bool_],  # see ``Quads``
     lit: NDArray[np.bool_],  # see ``Quads``
@@ -47,15 +47,15 @@ def prepare(
     pixel_area: float,  # 1/(fx fy) of the image
     # output: edge planes of each selected quad, as slopes along the grid's x and y and an offset, (n, 4, 3)
     edges: Floats,
-    planes: Floats,  # output: each selected quad's 1/z on the grid, as slopes along x and y and an offset, (n, 3)
-    # output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4)
+    planes: Floats,  # output: each selected quad's 1/z on the grid, as slopes along x and y plus an offset, (n, 3)
+    # output: the first grid row the quad may cover, the row after the last, and the same for columns, (n, 4)
     box: NDArray[np.int64],
     table: Singles,  # output: see ``sampling_table``, (13, n + 1)
 ) -> int:
     """Select the quads that may be visible, as ``visible_quads`` and ``sampling_table`` do.
 
     Returns:
-        The number of selected quads.
+        The number of quads selected.
     """
     width, height, fx, fy, cx, cy = grid[0], grid[1], grid[2], grid[3], grid[4], grid[5]
     left, right = -(0.5 + cx) / fx, (width - 0.5 - cx) / fx
@@ -92,7 +92,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # add a margin of two samples for rounding, because the edge planes decide
+        if ahead:  # add a margin of two samples for rounding, because the edge planes make the final decision
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx
@@ -148,15 +148,15 @@ def draw(
     rows_for: NDArray[np.int64],  # number of grid rows needed for each row of the image, (height,)
     ray_x: Singles,  # x of each pixel's ray (x, y, 1), (height, width)
     ray_y: Singles,  # y of each pixel's ray, (height, width)
-    sample_x: Singles,  # x of the ray through each column of the grid
+    sample_x: Singles,  # x of the rays through each column of the grid
     sample_y: Singles,  # y of the ray through each row of the grid
     nearest: Singles,  # work array: 1/z at each sample of a band, (BAND, columns)
     numbers: NDArray[np.int32],  # work array, (BAND, columns)
-    # Work array: each sample's column in the table, or 0 for none; the sign bit is set if the sample may differ from
-    # its neighbours to the right and below. Holds the most recently processed grid rows, as many as the image needs at
+    # Work array: each sample's column in the table, or 0 for none. The sign bit is set if the sample may differ from
+    # its neighbours to the right and below. Holds the most recently processed grid rows: as many as the image needs at
     # a time, rounded up to a power of two. (rows, columns).
     seen: Shorts,
-    pairs: NDArray[np.int64],  # each texel of the atlas and the one after it, BGRA each, packed into one number
+    pairs: NDArray[np.int64],  # each texel of the atlas and the texel after it, BGRA each, packed into one number
     atlas_size: tuple[int, int],  # number of rows and columns of the atlas
     gap: float,  # gap between two levels of a texture in the atlas [texels]
     farthest: float,  # 1/z assumed for a ray that points beyond a quad's horizon [1/m]
@@ -171,8 +171,8 @@ def draw(
 ) -> None:
     """Draw the same image as ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
-    For each band of the grid, find the nearest quad at each sample. Then colour the image rows that need no further
-    bands, while this band is still in the cache.
+    For each band of the grid, find the nearest quad at each sample. Then colour the image rows that depend on no
+    further bands, while this band is still in the cache.
     """
     zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
     three, parts = np.float32(3.0), np.float32(32.0)  # a texel is divided into 32 parts along each side
@@ -183,7 +183,7 @@ def draw(
     scale_x, scale_y, start_x, start_y = to_grid[0], to_grid[1], to_grid[2], to_grid[3]
     height, width = ray_x.shape
     grid_rows, columns = len(sample_y), len(sample_x)
-    kept = len(seen) - 1  # mask that converts a grid row to its row in ``seen``
+    kept = len(seen) - 1  # bit mask that maps a grid row to its row in ``seen``
     kept_, columns_ = np.int32(kept), np.int32(columns)
     seen_ = seen.reshape(-1)
     wide = float(columns)
@@ -197,7 +197,7 @@ def draw(
             crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
     differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
     none, sign = np.int16(0), np.int16(~NUMBER)
-    room = 5 * BLOCK  # one entry per pixel, plus four for its samples if they differ
+    room = 5 * BLOCK  # one entry per pixel, and four more for its samples if they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -208,7 +208,7 @@ def draw(
     colours = np.empty(room, np.int32)
     depth, shade = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     flat_x, flat_y = ray_x.reshape(-1), ray_y.reshape(-1)
-    known = compared = 0  # counts of grid rows
+    known = compared = 0  # numbers of grid rows
     for begin in range(0, height * width, BLOCK):
         count_ = min(BLOCK, height * width - begin)
         first_row, last_row = begin // width, (begin + count_ - 1) // width
@@ -267,7 +267,7 @@ def draw(
                     for n in range(columns):
                         line[n] |= near_by[n]
                 compared = end
-        # Find the quad at each pixel, and the pixels with several quads.
+        # Find the quad at each pixel, and the pixels that contain several quads.
         xs, ys = flat_x[begin : begin + count_], flat_y[begin : begin + count_]
         for n in range(count_):
             at_x, at_y = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
@@ -301,7 +301,7 @@ def draw(
             end = start + 1
             while end < count_ and number[end] == quad:
                 end += 1
-            # Round up to a multiple, to avoid a remainder; the next run overwrites the excess.
+            # Round up to a multiple in order to avoid a remainder; the next run overwrites the excess pixels.
             stop = min(start + (end - start + 31) // 32 * 32, count_)
             xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
             into = w_[start:stop]
@@ -359,7 +359,7 @@ def draw(
         for n in range(total):
             texel = np.uint64(spot[n])
             upper[n], lower[n] = pairs[texel], pairs[texel + next_row]
-        # Interpolate between four texels: blue and red together, as long as both fit into sixteen bits.
+        # Interpolate between four texels: blue and red are processed together, as long as both fit into sixteen bits.
         for n in range(total):
             a, b, c, d = above_[2 * n], above_[2 * n + 1], below_[2 * n], below_[2 * n + 1]
             right, down, bright = part_u[n], part_v[n], light[n]
@@ -373,7 +373,7 @@ def draw(
             c_, d_ = np.int32(np.int32(c >> 8) & 0xFF), np.int32(np.int32(d >> 8) & 0xFF)
             green = np.int32(np.int32(a_ << 5) + np.int32(right * np.int32(b_ - a_)))
             green_under = np.int32(np.int32(c_ << 5) + np.int32(right * np.int32(d_ - c_)))
-            # Round to nearest, halves up; with light, halves to even.
+            # Round to nearest, with halves rounded up; with light, halves are rounded to even.
             blue = np.int32(np.int32(np.int32(blue << 5) + np.int32(down * np.int32(blue_under - blue)) + 512) >> 10)
             green = np.int32(
                 np.int32(np.int32(green << 5) + np.int32(down * np.int32(green_under - green)) + 512) >> 10
@@ -397,7 +397,7 @@ def draw(
             height_, away_x, away_y, square = shadows[k, 0], shadows[k, 1], shadows[k, 2], shadows[k, 3]
             strength, thickness, more = shadows[k, 4], shadows[k, 5], shadows[k, 6]
             for row in range(max(first_row, boxes[k, 0]), min(last_row + 1, boxes[k, 1])):
-                at_row = row * width - begin  # start of the row relative to the block, possibly outside it
+                at_row = row * width - begin  # start of the row relative to the block; may lie outside it
                 start = max(at_row + boxes[k, 2], 0)
                 stop = max(min(at_row + boxes[k, 3], count_), start)
                 xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
@@ -419,7 +419,7 @@ def draw(
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)
                     green = np.int32(np.int32(green + np.int32(green >> 8)) & 0xFF00)
                     out[n] = np.int32(dark | green)
-        # Each number's fourth byte is the next pixel's first one, which is written later.
+        # Each number's fourth byte is the first byte of the next pixel, which is written later.
         bytes_ = packed[begin : begin + count_]
         for n in range(len(bytes_)):
             bytes_[n] = colours[n]

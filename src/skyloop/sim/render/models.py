@@ -1,6 +1,6 @@
 """Shapes in their own axes: dummies of people and cars, quadrotors, marker boards with their stands, platforms, cards.
 
-Dummies are made from textured boxes, with their origin on the ground, x ahead, y left, z up.
+Dummies are made of textured boxes, with their origin on the ground, x forward, y left and z up.
 """
 
 from __future__ import annotations
@@ -73,14 +73,14 @@ class Figure:
     """A figure's parts: the rigid body, and limbs that swing about their upper ends."""
 
     body: Quads
-    #: one group of quads per joint, all of the same size and with the joint as their origin; None if there are no limbs
+    #: one group of quads per joint, all of the same size and with the joint at their origin; None if there are no limbs
     limbs: Quads | None
     joints: Floats  #: positions of the joints, (limbs, 3)
     swings: Floats  #: forward swing of each limb in the middle of a step [rad], (limbs,)
     spots: tuple[Vec3, ...]  #: circles that make up the shadow: x, y, radius [m]
 
     def posed(self, position_m: Floats, rotation: Floats, walked_m: float) -> Quads:
-        """Return the figure at a position after a distance walked [m]; the swing starts and stops with the walk."""
+        """Return the figure at a position after it has walked a distance [m]; its limbs swing only while it walks."""
         body = self.body.moved(position_m, rotation)
         if self.limbs is None:
             return body
@@ -247,7 +247,7 @@ def _car_end(rgb: Rgb, *, front: bool) -> Image:
 
 
 def _glass(rgb: Rgb, *, panes: int) -> Image:
-    """Draw panes surrounded by the car's colour, with a bright streak."""
+    """Draw window panes surrounded by the car's colour, with a bright streak."""
     picture = draw_paint(rgb, 64, 128)
     width = 128 // panes
     for pane in range(panes):
@@ -269,7 +269,7 @@ def _wheel() -> Image:
     return picture
 
 
-# Hull colours of successive drones.
+# Hull colours of consecutive drones.
 HULLS: tuple[Rgb, ...] = (
     (235, 96, 24),
     (34, 132, 214),
@@ -300,7 +300,7 @@ def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, prio
 def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
     """Return a quadrotor in body axes: a hull with a nose, a crossed frame and four rotors.
 
-    The front rotors have the hull's colour to make the heading visible.
+    The front rotors have the colour of the hull, so that the heading is visible.
     """
     shapes = QuadBuilder()
     colour, dark = paint(atlas, hull), paint(atlas, _DARK)
@@ -337,7 +337,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def target(atlas: AtlasBuilder, target: Target) -> Quads:
-    """Return a target's shape without its stand. Figures are at rest."""
+    """Return a target's shape without its stand. Figures are shown at rest."""
     if isinstance(target, BoardTarget):
         return board(atlas, target)
     if isinstance(target, FigureTarget):
@@ -349,7 +349,7 @@ def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
     """Return a marker's card in front of a wooden board on a pole; origin is the card's centre, x its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # rotates face axes (right, up, normal) to (x ahead, y left, z up)
+    # rotates face axes (right, up, normal) to (x forward, y left, z up)
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     half = target.pattern.card_size_m / 2 + 0.02
     wood = atlas.add(("board", round(half, 3)), lambda: draw_surface("wood", 2 * half, 2 * half, min(256, 96 / half)))
@@ -369,7 +369,7 @@ def stand(atlas: AtlasBuilder) -> Quads:
 
 
 def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
-    """Return a slab on a column with a marker on its top; the origin is the top's centre, with x along the heading."""
+    """Return a slab on a column with a marker on top; the origin is the centre of the top, with x along the heading."""
     x, y, z = (side / 2 for side in target.size_m)
     density = min(200.0, 160.0 / max(x, y))
     top = atlas.add(("slab", target.texture, x, y), lambda: draw_surface(target.texture, 2 * x, 2 * y, density))
@@ -380,12 +380,12 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     body.box((-narrow, -narrow, -2 * z - _POLE_M), (narrow, narrow, -2 * z), paint(atlas, _DARK))
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # rotates face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
+    # rotates face axes (right, up, normal) to (x forward, y left, z up): the image's up is forward and its right is -y
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 
 
-_CELL = 24  # texels per cell of the marker
+_CELL = 24  # number of texels per cell of the marker
 _PAPER = 235
 
 

@@ -1,6 +1,6 @@
 """Drawing of images: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
 
-It is used until compilation is done, or always if compiled code is not available.
+It is used until compilation finishes, or permanently if compiled code is not available.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from skyloop.sim.render.shading import DepthBuffer, Grid, Placed, Rays, Shader, 
 class Raster:
     """Precomputed values for a lens: the positions of its samples on a distortion-free grid.
 
-    A pixel has either one sample, at the grid point nearest to its centre, or four, at the points around its centre.
-    Without distortion, these are exactly a quarter of a pixel to each side.
+    A pixel has either one sample, at the grid point nearest to its centre, or four samples, at the points around its
+    centre. Without distortion, these points are exactly a quarter of a pixel to each side.
     """
 
     grid: Grid
     samples: int  #: samples per pixel: 1 or 4
-    #: Flat index on the grid of each pixel's first sample, (pixels,). The other three are to its right, below it, and
-    #: below and to its right.
+    #: Flat index on the grid of each pixel's first sample, (pixels,). The other three samples are to its right, below
+    #: it, and below and to its right.
     lookup: NDArray[np.int32]
-    #: Scales in x and y, then offsets in x and y. Scaling a ray (x, y, 1) from ``rays`` and adding the offsets gives
-    #: the column and row of its first sample after truncation. Computed in single precision, like ``lookup``.
+    #: Scales in x and y, then offsets in x and y. Scaling a ray (x, y, 1) from ``rays`` and adding the offsets gives,
+    #: after truncation, the column and row of its first sample. Computed in single precision, like ``lookup``.
     to_grid: NDArray[np.float32]
     sample_x: NDArray[np.float32]  #: x/z of each column of the grid
     sample_y: NDArray[np.float32]  #: y/z of each row of the grid
@@ -39,7 +39,7 @@ class Raster:
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion."""
+        """Compute one or four samples per pixel; with distortion, this takes 0.2 s once for 960×720 pixels."""
         return _raster(model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
 
 
@@ -53,7 +53,7 @@ def _raster(
     fine, first, more = (2, 0.5, 1) if samples > 1 else (1, 0.0, 0)
     scale = np.array([fine * fx, fine * fy])
     low = centre.min(axis=0) * scale
-    # Without distortion, the grid's samples coincide with the image's pixels; otherwise the grid has one more.
+    # Without distortion, the grid's samples coincide with the image's pixels; otherwise the grid has one extra sample.
     middle = np.ceil(1.0 - low) if model.distorted else first - low
     to_grid = np.concatenate([scale, middle + (0.5 - first)]).astype(np.float32)
     x, y = (np.ascontiguousarray(part.astype(np.float32).reshape(height, width)) for part in centre.T)
@@ -79,7 +79,7 @@ def _rays(model: CameraModel) -> NDArray[np.float64]:
 
 
 class Painter(ABC):
-    """Draws through one lens. It reuses buffers, so use it from one thread at a time."""
+    """Draws images as seen through one lens. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
         self.raster = raster
@@ -125,7 +125,7 @@ class PlainPainter(Painter):
             darken(picture, shadow, rays, self._inverse_depth)
 
     def _resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-        """Return the table's column of each pixel's first sample, (pixels,), and the pixels with differing samples."""
+        """Return the table column of each pixel's first sample, (pixels,), and the pixels whose samples differ."""
         raster, numbers = self.raster, self._numbers
         for k, step in enumerate(self._steps):
             np.take(seen[step:], raster.lookup, out=numbers[k], mode="clip")
@@ -134,7 +134,7 @@ class PlainPainter(Painter):
     def _smooth(
         self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]
     ) -> None:
-        """Colour the pixels whose samples show different quads, averaging all their samples."""
+        """Colour the pixels whose samples hit different quads, by averaging all of their samples."""
         raster = self.raster
         places = (raster.lookup[pixels] + np.array(self._steps, dtype=np.int32)[:, None]).reshape(-1)
         row = places // raster.grid.width

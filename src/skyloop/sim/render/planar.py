@@ -1,13 +1,13 @@
-"""The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
+"""The renderer for simulated cameras. It needs one core and no display, GPU or system packages.
 
-The first step determines which quad is at each sample of the image, and the second colours each pixel once
-(``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
-coloured and averaged, for smooth silhouettes. With distortion, the lens determines where the samples are, so nothing is
-resampled and textures stay sharp.
+The first step determines which quad is at each sample of the image, and the second step colours each pixel once
+(``shading``), so hidden surfaces cost little. If the samples of a pixel hit different quads, all four samples are
+coloured and averaged, for smooth silhouettes. With distortion, the lens determines the positions of the samples, so
+nothing is resampled and textures stay sharp.
 
-:class:`PlainPainter` does this with NumPy and OpenCV. ``compiled`` does the same arithmetic in loops compiled by Numba,
-several times faster, once they are ready. Both give the same image, bit by bit, for the same scene, state, pose and
-model.
+:class:`PlainPainter` does this with NumPy and OpenCV. ``compiled`` does the same arithmetic in loops compiled by Numba;
+they are several times faster, once they are ready. Both implementations give bit-identical images for the same scene,
+state, pose and model.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from skyloop.sim.render.quads import Image, SceneState, cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
-#: Number of images that a renderer draws before it compiles; for fewer, compilation takes longer than it saves.
+#: Number of images that a renderer draws before it compiles; with fewer images, compiling takes longer than it saves.
 WORTH_COMPILING: Final = 30
 
 
 class Quality(Enum):
     """How an image is sampled."""
 
-    FAST = "fast"  #: one sample per pixel: jagged edges, and with distortion an error of up to half a pixel
+    FAST = "fast"  #: one sample per pixel: edges are jagged, and with distortion the error is up to half a pixel
     SMOOTH = "smooth"  #: four samples per pixel along edges: as good as BEST except for shimmer within textures
     BEST = "best"  #: four samples for every pixel
 
@@ -43,7 +43,7 @@ class Quality(Enum):
 def use_one_core() -> None:
     """Restrict OpenCV to the calling thread in this whole process.
 
-    Images this small don't benefit from more threads, and OpenCV's workers would occupy cores that proxies and
+    Images this small do not benefit from more threads, and OpenCV's worker threads would occupy cores that proxies and
     applications need. A process that only runs a simulation calls this once when it starts.
     """
     cv2.setNumThreads(1)
@@ -52,7 +52,7 @@ def use_one_core() -> None:
 def dimmed(picture: Image, light: float) -> Image:
     """Multiply all values of an image in place by a factor of at least 0, rounded, and return the image.
 
-    A table of 256 values makes the result identical bit by bit on every machine.
+    A table of 256 values makes the result bit-identical on every machine.
     """
     table = np.clip(np.rint(np.arange(256) * light), 0, 255).astype(np.uint8)
     np.copyto(picture, cv2.LUT(picture, table))
@@ -62,8 +62,8 @@ def dimmed(picture: Image, light: float) -> Image:
 class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
-    :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so use it from one thread at a
-    time. Several renderers can share a scene. Without a compiler it never draws with compiled code.
+    :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so it must be used from one
+    thread at a time. Several renderers can share a scene. If there is no compiler, it never draws with compiled code.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class PlanarRenderer:
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
     """Precompute a lens's values to save time on its first image: 0.2 s for 960×720 pixels with distortion.
 
-    They are kept for all renderers in the process.
+    The values are kept for all renderers in the process.
     """
     Raster.of(_doubled(model) if quality is Quality.BEST else model, _samples(quality))
 
@@ -145,13 +145,13 @@ def _doubled(model: CameraModel) -> CameraModel:
 
 
 _NOISE_MARGIN = 61  # extra rows and columns of noise around the image, so that each frame can use a different part
-_BLUR_FROM_PX = 0.8  # minimum length of visible blur
+_BLUR_FROM_PX = 0.8  # minimum length at which blur is visible
 
 
 class SensorEffects:
-    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use from one thread at a time.
+    """Imperfections of a camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
 
-    The imperfections of frame ``number`` depend only on the seed and the number, not on earlier frames.
+    The imperfections of frame ``number`` depend only on the seed and that number, not on earlier frames.
     """
 
     def __init__(self, model: CameraModel, seed: int = 0) -> None:
@@ -161,15 +161,15 @@ class SensorEffects:
         self._gain = _gain(model)
         shape = (model.height + _NOISE_MARGIN, (model.width + _NOISE_MARGIN) * 3)
         noise = np.rint(rng.standard_normal(shape, dtype=np.float32) * np.float32(model.noise_sigma))
-        # Saturated addition and subtraction of two byte images cost a tenth of one signed addition.
+        # Saturated addition and saturated subtraction of two byte images together cost a tenth of one signed addition.
         self._brighter = np.clip(noise, 0, 255).astype(np.uint8)
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
         """Apply the imperfections to a BGR image of the camera's size, in place, and return it.
 
-        The drone's angular velocity about its body axes (x forward, y left, z up), (3,), blurs the image over the
-        exposure; None if the drone does not turn. ``number`` is the frame number.
+        The drone's angular velocity about its body axes (x forward, y left, z up), (3,), determines the motion blur
+        during the exposure; None if the drone does not turn. ``number`` is the frame number.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
@@ -189,7 +189,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # The scene moves to the left if the camera rotates about y (down), down if about x (right). Roll is ignored.
+        # The scene moves left if the camera rotates about y (down), and down if about x (right). Roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
@@ -197,14 +197,14 @@ class SensorEffects:
         steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
         right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
         across, along = abs(right).max(), abs(down).max()
-        # Keep this as small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
+        # Keep this as small as possible: for large kernels, OpenCV uses a slow method in the frequency domain.
         kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
         np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 
 def _gain(model: CameraModel) -> Image | None:
-    """Return exposure and vignetting in steps of 1/128; None if there is neither.
+    """Return exposure and vignetting in steps of 1/128, or None if there is neither.
 
     Like a cos⁴ falloff, vignetting grows with the square of the distance from the centre.
     """

@@ -1,6 +1,6 @@
 """The renderer's input and output, textured convex quadrilaterals stored as arrays, and shapes with their textures.
 
-All textures are in one image, each with its smaller versions (mip levels) next to it.
+All textures are in one image; each has its smaller versions (mip levels) next to it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("the simulator", "sim", cause=str(error)) from error
 
-__all__ = ["cv2"]  # re-exported; everything else is this module's own
+__all__ = ["cv2"]  # re-exported; all other names are defined in this module
 
 Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 
@@ -28,21 +28,21 @@ Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 class SceneState:
     """The poses of all moving objects at a point in time.
 
-    The renderer may cache results for as long as it receives the same state object, so don't write to a state's arrays
-    afterwards.
+    The renderer may cache results for as long as it receives the same state object, so the arrays of a state must not
+    be modified afterwards.
     """
 
     drone_positions_m: NDArray[np.float64]  #: positions of the bodies' origins in world axes, shape (n, 3)
     drone_rotations: NDArray[np.float64]  #: world from body, shape (n, 3, 3)
     targets: tuple[TargetState, ...] = ()  #: one state for each target in the world, in the world's order
-    #: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
+    #: Brightness of the whole image, where 1 means full brightness. See :class:`~skyloop.sim.world.Light`.
     light: float = 1.0
 
 
 LEVELS = 7
-BORDER = 4  # pixels repeated around each level, so that interpolation at the rim stays within the level
+BORDER = 4  # pixels repeated around each level, so that interpolation at the edge stays within the level
 GAP = 2 * BORDER
-_STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this, so that each level can be halved exactly
+_STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this step, so that every level can be halved exactly
 _LIMIT = 32000  # cv2.remap accepts source images of at most 32767 pixels per side
 
 
@@ -59,21 +59,21 @@ class Texture:
 class Atlas:
     """All textures in one image."""
 
-    image: NDArray[np.uint8]  #: the image, BGRA (OpenCV samples four channels twice as fast as three)
+    image: NDArray[np.uint8]  #: the image in BGRA (OpenCV samples four channels twice as fast as three)
     x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
     y0: NDArray[np.float64]  #: row where each texture's level 0 starts; same type and shape
     span: NDArray[np.float64]  #: twice the padded width of each texture
 
 
 class AtlasBuilder:
-    """Collects textures by key, drawing each once, and packs them."""
+    """Collects textures by key, draws each one once, and packs them."""
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
         self.images: list[Image] = []  #: textures added so far, in the order of their numbers, BGR, shape (h, w, 3)
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
-        """Return the texture for ``key``. If there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
+        """Return the texture for ``key``. If there is none yet, ``make`` draws the texture (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
             self._known[key] = Texture(len(self.images), image.shape[1], image.shape[0])
@@ -130,18 +130,18 @@ _CORNERS = 4  # number of corners, a quad's first vectors; the normal and the sl
 
 @dataclass(frozen=True, slots=True)
 class Quads:
-    """``n`` flat convex quadrilaterals. A triangle repeats a corner.
+    """``n`` flat convex quadrilaterals. A triangle is stored with one corner repeated.
 
-    Texel u of a point X in the plane is ``u_slope · X + u_start``, and likewise for v. u points right and v down, both
-    from the texture's top left edge.
+    Texel u of a point X in the plane is ``u_slope · X + u_start``, and likewise for v. u points right and v points
+    down, both measured from the texture's top left corner.
     """
 
     vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)
     starts: Floats  #: offsets of u and v, (n, 2) [texel]
     texture: NDArray[np.intp]  #: number in the atlas, (n,)
-    two_sided: NDArray[np.bool_]  #: whether it is visible from behind as well, (n,)
-    priority: NDArray[np.intp]  #: priority, (n,); the highest one in a plane is visible
-    lit: NDArray[np.bool_]  #: whether it is brighter when facing the light, (n,); false for the sky
+    two_sided: NDArray[np.bool_]  #: whether the quad is also visible from behind, (n,)
+    priority: NDArray[np.intp]  #: priority, (n,); the quad with the highest priority in a plane is visible
+    lit: NDArray[np.bool_]  #: whether the quad is brighter when it faces the light, (n,); false for the sky
     density: Floats  #: texels per area, (n,) [texel/m²]
 
     def __len__(self) -> int:
@@ -154,7 +154,7 @@ class Quads:
 
     @property
     def normals(self) -> Floats:
-        """Unit vectors pointing to the front, (n, 3)."""
+        """Unit normals that point to the front, (n, 3)."""
         return self.vectors[:, _CORNERS]
 
     @property
@@ -178,7 +178,7 @@ class Quads:
         return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
-        """Return these quads with others appended."""
+        """Return these quads with other quads appended."""
         return concatenate([self, other])
 
     def moved(self, position_m: Floats, rotation: Floats) -> Quads:
@@ -209,7 +209,7 @@ def concatenate(parts: list[Quads]) -> Quads:
 
 
 class QuadBuilder:
-    """Collects single quads."""
+    """Collects quads one at a time."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[Floats, Floats, Floats, Floats, float, float, int, bool, int, bool]] = []
@@ -228,8 +228,8 @@ class QuadBuilder:
     ) -> None:
         """Add a rectangle as seen from the front: its lower left corner and its edges to the right and upwards [m].
 
-        Of the quads in a plane, the one with the highest priority is visible; a ``lit`` one is brighter when facing the
-        light. ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
+        Of the quads in a plane, the one with the highest priority is visible; a ``lit`` quad is brighter when it faces
+        the light. ``uv`` is the visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -248,7 +248,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a quad (4, 3) cut from the textured rectangle defined by the corner and the two edges."""
+        """Add a quad (4, 3) cut from the textured rectangle that is defined by the corner and the two edges."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))
@@ -271,10 +271,10 @@ class QuadBuilder:
     def box(
         self, low: ArrayLike, high: ArrayLike, sides: Texture | tuple[Texture, Texture], ends: Texture | None = None
     ) -> None:
-        """Add an upright box that is visible from outside, between its lowest and highest corner [m].
+        """Add an upright box that is visible from outside and extends from its lowest to its highest corner [m].
 
-        A pair of ``sides`` holds the textures of the faces that face along x and along y; ``ends`` is for top and
-        bottom, by default the texture along x.
+        A pair of ``sides`` holds the textures of the faces normal to x and to y; ``ends`` is for top and bottom, by
+        default the texture along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

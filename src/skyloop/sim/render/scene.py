@@ -17,12 +17,12 @@ from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import BoardTarget, Box, FigureTarget, PlatformTarget, Room, World
 
-_FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded
+_FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded completely
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """All parts of a scene at a point in time. ``drone``: the drone whose body a quad belongs to, or -1, (n,)."""
+    """All parts of a scene at a point in time. ``drone``: the drone to whose body a quad belongs, or -1, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]
@@ -32,8 +32,8 @@ class Posed:
 class Scene:
     """The renderable parts of a world and its drones.
 
-    Building it draws all textures (a few tenths of a second). It never changes afterwards, so renderers on several
-    threads can share it.
+    The constructor draws all textures (which takes a few tenths of a second). The scene never changes afterwards, so
+    renderers on several threads can share it.
     """
 
     def __init__(self, world: World, drones: int = 1) -> None:
@@ -54,9 +54,9 @@ class Scene:
             for target, template in zip(world.targets, self._targets, strict=True)
             for part in ([template, self._stand] if isinstance(target, BoardTarget) else [template])
         ]
-        # All parts, in the order used by ``posed``, for properties that don't change with motion.
+        # All parts, in the order used by ``posed``, for properties that motion does not change.
         self._everything = concatenate([self._static, *standing, *self._hulls])
-        #: Number of the world's target that a quad belongs to, -1 for none, (n,).
+        #: Index of the world target that each quad belongs to, or -1 if none, (n,).
         self.target_of = np.concatenate(
             [np.full(len(self._static), -1, np.intp)]
             + [
@@ -65,7 +65,7 @@ class Scene:
             ]
             + [np.full(len(hull), -1, np.intp) for hull in self._hulls]
         )
-        #: Number of the world's box that a quad belongs to, -1 for none, (n,).
+        #: Index of the world box that each quad belongs to, or -1 if none, (n,).
         self.box_of = np.full(len(self.target_of), -1, np.intp)
         sides = np.repeat(np.arange(len(world.solids())), SIDES)
         first = len(self._static) - len(world.panels) - len(world.markers) - len(sides)
@@ -75,7 +75,7 @@ class Scene:
         self._owner = np.concatenate(owners)
         self._swarm = concatenate(self._hulls) if self._hulls else None
         self.atlas = atlas.pack()
-        # Surfaces for shadows to fall on: upright solids, as cosine and sine of yaw, centre, half size and top.
+        # Surfaces on which shadows fall: upright solids, as cosine and sine of yaw, centre, half size and top.
         self._tops = [
             (
                 math.cos(box.yaw_rad),
@@ -145,12 +145,12 @@ def _yaw(angle: float) -> NDArray[np.float64]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-_FINEST = 128.0  # texels per metre of a room's surfaces, if its size allows
+_FINEST = 128.0  # texels per metre of a room's surfaces, if their size allows
 _LARGEST = 1280.0  # maximum number of texels along a side of a room's surface
 _AFAR_M = 150.0  # extent of the open ground
 _SKY_M = 400.0  # half the side of the sky
 SIDES = 6  #: quads per box; ``static_quads`` has the shell first, then boxes, panels, markers
-# Direction of solids' shadows: away from the light in ``shading``, but short, as in a room lit from all sides.
+# Direction of the shadows of solids: away from the light in ``shading``, but short, as in a room lit from all sides.
 _LEAN = np.array([-0.16, 0.20])
 
 
@@ -241,7 +241,7 @@ def _ceiling(room: Room, density: float) -> NDArray[np.uint8]:
     per_m = density / 2
     picture = draw_surface(room.ceiling, room.size_m[0], room.size_m[1], per_m)
     height, width = picture.shape[:2]
-    bright = 1.16 if room.ceiling == "plaster" else 1.0  # the floor reflects light onto surfaces that face down
+    bright = 1.16 if room.ceiling == "plaster" else 1.0  # the floor reflects light onto surfaces that face downwards
     lit = _shaded(picture, bright * _corner_dark(height, width, per_m, 0.18, 0.18, 0.18))
     for cx in np.arange(1, 2 * max(1, round(room.size_m[0] / 3)), 2) / (2 * max(1, round(room.size_m[0] / 3))):
         for cy in np.arange(1, 2 * max(1, round(room.size_m[1] / 3)), 2) / (2 * max(1, round(room.size_m[1] / 3))):
@@ -281,12 +281,12 @@ def _box(box: Box, atlas: AtlasBuilder) -> Quads:
 
 
 def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
-    """Add the ground around the room's floor, as far as it is visible, and a sky."""
+    """Add the ground around the room's floor up to the limit of visibility, and a sky."""
     x, y, far = room.size_m[0] / 2, room.size_m[1] / 2, _AFAR_M
     ground = _surface(atlas, room.floor, 2 * far, 2 * far, 512 / (2 * far))
     for low, high in (((-far, -far), (far, -y)), ((-far, y), (far, far)), ((-far, -y), (-x, y)), ((x, -y), (far, y))):
         if high[0] <= low[0] or high[1] <= low[1]:
-            continue  # the floor extends this far
+            continue  # the floor extends up to this edge
         texels = ground.width / (2 * far)
         uv = ((low[0] + far) * texels, (far - high[1]) * texels, (high[0] + far) * texels, (far - low[1]) * texels)
         shapes.rectangle((*low, 0), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), ground, uv=uv)

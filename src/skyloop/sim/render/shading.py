@@ -1,11 +1,11 @@
 """Find the quad visible at each sample of an image, and colour the samples, with soft shadows.
 
-Quads are found by geometry without clipping and a depth buffer. A ray r through the eye meets a convex polygon in front
-of the eye exactly if it is on the inner side of every plane through the eye and an edge: (v_i × v_{i+1}) · r has the
-same sign for all edges. This also holds for corners behind the eye, so nothing is clipped and no wall is lost at a
-grazing angle. On one row of the image, each edge becomes a limit on x. Across the image, 1/z is linear: 1/z = (n · r) /
-(n · v_0). Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", Graphics Hardware
-1997.
+Quads are found by geometry, with neither clipping nor a conventional depth buffer. A ray r through the eye meets a
+convex polygon in front of the eye exactly if it is on the inner side of every plane through the eye and an edge: (v_i ×
+v_{i+1}) · r has the same sign for all edges. This also holds for corners behind the eye, so nothing is clipped and no
+wall is lost at a grazing angle. On one row of the image, each edge becomes a limit on x. Across the image, 1/z is
+linear: 1/z = (n · r) / (n · v_0). Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous
+Coordinates", Graphics Hardware 1997.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from skyloop.sim.camera import CameraPose
 from skyloop.sim.render.quads import GAP, LEVELS, Atlas, Floats, Quads, cv2
 
-# Fraction of its distance by which a picture counts as closer than the wall behind it, per step of priority.
+# Fraction of its distance by which a picture is considered closer than the wall behind it, per step of priority.
 PRIORITY_SHARE = 1e-3
-# Maximum distance between the eye and a quad's plane for the quad to count as edge-on and invisible [m].
+# Maximum distance between the eye and the plane of a quad that is considered edge-on and therefore invisible [m].
 EDGE_ON_M = 1e-5
-_BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
+_BAND = 32768  # samples of a quad per batch; small enough for the working arrays to stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Samples of a distortion-free image plane, where sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
+    """Samples of a distortion-free image plane: sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
 
     width: int
     height: int
@@ -39,7 +39,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The quads that may be visible from a pose, and their position on the grid. All arrays have m as their first axis.
+    """The quads that may be visible from a pose, and their position on the grid. The first axis of all arrays is m.
 
     ``index``: indices in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
     ``height_m``: signed height of the eye above the plane, (m,). ``first``, ``end``: columns covered in each row,
@@ -55,17 +55,17 @@ class View:
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return a · b along the last axis of three, summed in fixed order, so the bits don't depend on libraries."""
+    """Return a · b along the last axis, of length 3, summed in fixed order, so the bits don't depend on libraries."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
 def turned(vectors: Floats, rotation: Floats) -> Floats:
-    """Return vectors, shape (…, 3), multiplied by a rotation from the right, with sums as in :func:`dot`."""
+    """Return vectors, shape (…, 3), multiplied from the right by a rotation, with sums as in :func:`dot`."""
     return np.stack([dot(vectors, rotation[:, axis]) for axis in range(3)], axis=-1)
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return the ``shown`` quads, (n,), that would each be visible on its own from a pose through a grid.
+    """Return those ``shown`` quads, (n,), that would each be visible on its own from a pose through a grid.
 
     :class:`DepthBuffer` handles occlusion.
     """
@@ -102,11 +102,11 @@ def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Return the first and one-past-last column in each row, (m, height), inside edge planes, (m, 4, 3)."""
+    """Return the first and the one-past-last column of each row, (m, height), inside edge planes, (m, 4, 3)."""
     slope_x = edges[..., 0] / grid.fx
     slope_y = edges[..., 1] / grid.fy
     start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
-    # An exactly level edge does not bound any columns; with this tiny slope it includes all or none of a row.
+    # An exactly level edge does not bound any columns; with this tiny slope, it includes all or none of a row.
     slope_x[slope_x == 0.0] = 1e-30
     crossing = (slope_y / -slope_x)[..., None] * np.arange(grid.height) + (start / -slope_x)[..., None]
     rising = (slope_x > 0.0)[..., None]
@@ -130,8 +130,8 @@ class DepthBuffer:
         self._number = np.empty(working, np.int32)
         self._mask = np.empty(working, np.uint8)
         self._scratch = np.empty(working, np.bool_)
-        #: Index in the view of the quad at each sample plus one, 0 for none; int32, shape (height, width). Overwritten
-        #: by the next :meth:`draw`.
+        #: Index (in the view) plus one of the quad at each sample, 0 for no quad; int32, shape (height, width).
+        #: Overwritten by the next call of :meth:`draw`.
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
@@ -176,7 +176,7 @@ class DepthBuffer:
         cv2.copyTo(number, mask, self.seen[y0:y1, x0:x1])
 
 
-CHUNK = 16384  # samples per batch: few enough for the working arrays to stay in the cache
+CHUNK = 16384  # samples per batch; small enough for the working arrays to stay in the cache
 
 # Light from high above and slightly from the east and south, plus ambient light: moderate contrast between faces.
 SUN = np.array([0.33, -0.42, 0.85])
@@ -186,7 +186,7 @@ UNIT = 128.0  # eight-bit gain that represents a light of 1.0
 # Factor for the pixel size when choosing a level: sharper textures that shimmer slightly. Doubled, as explained below.
 FOOTPRINT = 2.0 * 0.6
 FARTHEST = np.float32(1e-6)  # 1/z assumed for a ray that points beyond a quad's horizon [1/m]
-_ONE = 0x3F800000  # 1.0 as the bits of a float32
+_ONE = 0x3F800000  # bit pattern of 1.0 as a float32
 
 
 def light_on(normals: Floats) -> Floats:
@@ -197,8 +197,8 @@ def light_on(normals: Floats) -> Floats:
 def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pixel_area: float) -> NDArray[np.float32]:
     """Return one column per quad in the view, after a column 0 for "nothing".
 
-    The rows are a', b', c (three each), footprint, atlas x and y, and light; float32, shape (13, m + 1). ``pixel_area``
-    is 1/(fx fy) of the image.
+    The rows are a', b', c (three rows each), footprint, atlas x and y, and light; float32, shape (13, m + 1).
+    ``pixel_area`` is 1/(fx fy) of the image.
     """
     k = view.index
     c = view.inverse_depth
@@ -216,12 +216,12 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     table[11, 1:] = atlas.y0[texture] - 0.5
     facing = np.where(view.height_m > 0.0, 1.0, -1.0)[:, None]
     table[12, 1:] = np.where(quads.lit[k], light_on(quads.normals[k] * facing), 1.0) * UNIT
-    table[8, 0] = 1.0  # any finite depth will do for "nothing", because its light is 0
+    table[8, 0] = 1.0  # any finite depth works for "nothing", because its light is 0
     return table.astype(np.float32)
 
 
 class Shader:
-    """Colours samples from an atlas. It reuses buffers, so use it from one thread at a time."""
+    """Colours samples from an atlas. The shader reuses buffers, so it must be used from one thread at a time."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._image = atlas.image
@@ -299,7 +299,7 @@ class Shader:
         np.add(v, got, out=v)
         np.clip(u, 0.0, self._image.shape[1] - 2.0, out=u)
         np.clip(v, 0.0, self._image.shape[0] - 2.0, out=v)
-        # In 1/32 texel, which all versions of OpenCV round the same way and sample faster.
+        # Coordinates in 1/32 texel: all versions of OpenCV round these the same way and sample them faster.
         cv2.convertMaps(u[None], v[None], cv2.CV_16SC2, dstmap1=self._places[:, :n], dstmap2=self._parts[:, :n])
         places, parts = self._places[:, :n], self._parts[:, :n]
         cv2.remap(self._image, places, parts, cv2.INTER_LINEAR, dst=colours, borderMode=cv2.BORDER_REPLICATE)
@@ -310,7 +310,7 @@ class Shader:
         cv2.multiply(colours, light4, dst=colours, scale=1.0 / UNIT)
 
 
-# Maximum distance from a shadow's plane at which it darkens a pixel, as a fraction of the pixel's depth.
+# Maximum distance of a pixel from a shadow's plane at which the shadow darkens it, as a fraction of the pixel's depth.
 _THICKNESS = 4e-3
 _MORE_M = 4e-3
 _NEAR_M = 0.01
@@ -318,7 +318,7 @@ _NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A level round spot that gets less light."""
+    """A level, round area that receives less light."""
 
     centre_m: NDArray[np.float64]  #: centre in world axes
     radius_m: float  #: outer radius
@@ -327,7 +327,7 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """Minimum and maximum of x/z or y/z in each column or row of an image, (n,), and overall."""
+    """Minimum and maximum of x/z or y/z, in each column or row of an image, (n,), and overall."""
 
     least: NDArray[np.float32]
     most: NDArray[np.float32]
@@ -341,7 +341,7 @@ class Extremes:
         return Extremes(least, most, float(least.min()), float(most.max()))
 
     def span(self, low: float, high: float) -> tuple[int, int] | None:
-        """Return the first column or row with values between two bounds and the one after the last, or None."""
+        """Return the first column or row with values between two bounds and the one after the last such, or None."""
         if not (low <= self.high and high >= self.low):
             return None
         where = ((self.most >= low) & (self.least <= high)).nonzero()[0]
@@ -350,7 +350,7 @@ class Extremes:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """x/z and y/z of each pixel of a lens, (height, width), and their extremes in each column and row."""
+    """x/z and y/z of each pixel seen through a lens, (height, width), and their extremes in each column and row."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -359,7 +359,7 @@ class Rays:
 
     @staticmethod
     def of(x: NDArray[np.float32], y: NDArray[np.float32]) -> Rays:
-        """Compute the extremes."""
+        """Compute the minimum and maximum values."""
         return Rays(x, y, Extremes.along(x, 0), Extremes.along(y, 1))
 
 
@@ -367,7 +367,7 @@ class Rays:
 class Placed:
     """A shadow in a camera's view."""
 
-    #: first row that may show the shadow, row after the last, first column, column after the last
+    #: first row that may show the shadow, row after the last one, first column, column after the last one
     box: tuple[int, int, int, int]
     axes: NDArray[np.float32]  #: rotation from optical to world axes
     #: height of its plane above the camera [m]; camera's offset from its centre, east and north [m]; squared radius
@@ -376,7 +376,7 @@ class Placed:
 
 
 def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
-    """Return a shadow in a camera's view; None if it is not visible anywhere."""
+    """Return a shadow in a camera's view, or None if no part of it is visible."""
     away = pose.position_m - shadow.centre_m
     at = _seen_at((-away @ pose.rotation).tolist(), (shadow.radius_m * pose.rotation[:2]).tolist())
     if not at:
@@ -408,9 +408,9 @@ def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth
 
 
 def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float, float]]:
-    """Return x/z and y/z of the corners of the part of a square that is more than 1 cm ahead, in optical axes.
+    """Return x/z and y/z, in optical axes, of the corners of the part of a square that is more than 1 cm ahead.
 
-    ``sides`` are the vectors from its centre to the middles of two sides [m].
+    ``sides`` are the vectors from the square's centre to the midpoints of two sides [m].
     """
     (ax, ay, az), (bx, by, bz) = sides
     signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

@@ -1,7 +1,7 @@
 """Procedurally drawn surfaces for worlds: every name in :data:`skyloop.sim.world.TEXTURES`.
 
 Materials (parquet, brick …) have the same scale on surfaces of any size; objects (crate, door, window, posters) fill
-the surface once. All are reproducible: the same size and seed give the same pixels.
+the surface once. All textures are reproducible: the same size and seed give the same pixels.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ def clouds(rng: np.random.Generator, height: int, width: int, cell_x: float, cel
 
 
 def grain(rng: np.random.Generator, height: int, width: int) -> Gray:
-    """Return pixel noise, uniform within ±1, shape (height, width). It repeats every 256 pixels."""
+    """Return pixel noise, uniform within ±1, shape (height, width). The pattern repeats every 256 pixels."""
     patch = rng.random((min(height, 256), min(width, 256)), dtype=np.float32) * np.float32(2.0) - np.float32(1.0)
     return np.tile(patch, (-(-height // 256), -(-width // 256)))[:height, :width]
 
 
 def fractal(rng: np.random.Generator, height: int, width: int, cell: float, octaves: int = 4) -> Gray:
-    """Return clouds with finer clouds added, about ±1, shape (height, width)."""
+    """Return clouds with finer clouds added, with values of about ±1, shape (height, width)."""
     total = np.zeros((height, width), np.float32)
     for k in range(octaves):
         if cell / 2**k >= 1.5:
@@ -43,13 +43,13 @@ def fractal(rng: np.random.Generator, height: int, width: int, cell: float, octa
 
 
 def tinted(colour: tuple[float, float, float], brightness: ArrayLike, height: int, width: int) -> NDArray[np.float32]:
-    """Return a picture (height, width, 3) of one BGR colour multiplied by a brightness around 1."""
+    """Return a picture (height, width, 3) of a single BGR colour multiplied by a brightness of around 1."""
     light = np.broadcast_to(np.asarray(brightness, dtype=np.float32), (height, width))
     return np.asarray(cv2.merge([light * np.float32(c) for c in colour]), dtype=np.float32)
 
 
 def finished(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return the picture as bytes after clipping the values."""
+    """Clip the values and return the picture as bytes."""
     return np.clip(picture, 0.0, 255.0).astype(np.uint8)
 
 
@@ -206,7 +206,7 @@ Drawing = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A surface to draw on, with its size in pixels, pixels per metre and its own random generator."""
+    """A surface to draw on, with its size in pixels, its pixels per metre and its own random generator."""
 
     height: int
     width: int
@@ -229,7 +229,7 @@ class Sheet:
 
 
 def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed: int = 0) -> NDArray[np.uint8]:
-    """Draw a surface, given its size in metres and the texels per metre, BGR, as seen upright."""
+    """Draw a surface in BGR, as seen upright, given its size in metres and the number of texels per metre."""
     if name not in _SURFACES and name not in PICTURES:
         raise UnknownNameError("texture", name, [*_SURFACES, *PICTURES])
     height, width = max(4, round(height_m * per_m)), max(4, round(width_m * per_m))
@@ -258,7 +258,7 @@ def paint(atlas: AtlasBuilder, rgb: tuple[int, int, int]) -> Texture:
 
 
 def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple[NDArray[np.intp], Drawing, Drawing]:
-    """Lay planks or bricks in courses: return each pixel's piece, and its position (0 … 1) along and across it."""
+    """Lay planks or bricks in rows: return each pixel's piece, and its position (0 … 1) along and across that piece."""
     course = sheet.y_m / course_m
     course_number = np.floor(course).astype(np.intp)
     along = sheet.x_m / length_m + (course_number * shift).astype(np.float32)
@@ -267,7 +267,7 @@ def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple
 
 
 def _per_piece(piece: NDArray[np.intp], salt: int) -> Drawing:
-    """Return a number within ±1 for each pixel that is constant over each piece."""
+    """Return a number within ±1 for each pixel; all pixels of a piece have the same number."""
     values = np.random.default_rng([salt, 7]).random(1009, dtype=np.float32) * np.float32(2.0) - np.float32(1.0)
     return np.asarray(values[piece % 1009])
 
@@ -395,7 +395,7 @@ def _books(s: Sheet) -> Drawing:
 
 
 def _book(s: Sheet, picture: Drawing, x: int, bottom: int, room: int) -> int:
-    """Draw the spine of a book that stands at a column, and return the column after it."""
+    """Draw the spine of a book that stands at a given column, and return the next free column."""
     wide = max(2, s.px(s.rng.uniform(0.018, 0.055)))
     end = min(x + wide, s.width)
     if s.rng.random() < 0.08:  # a gap
