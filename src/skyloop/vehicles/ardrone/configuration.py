@@ -220,7 +220,7 @@ class Configurator:
         self._end_step()
         self._exchange = None
         exchange.done(failure)
-        if self._exchange is None:  # unless the callback submitted another one
+        if self._exchange is None:  # unless the callback submitted another exchange
             self._next_exchange()
 
 

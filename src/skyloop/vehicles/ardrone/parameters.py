@@ -205,7 +205,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
 
 
 def _choices(name: str, version: int | None) -> tuple[int, ...]:
-    """Return the allowed values of a key for which they depend on the drone's version."""
+    """Return a key's allowed values if they depend on the drone's version."""
     if name == CHANNEL_KEY:
         return tuple(range(len(_CHANNELS[version or 2])))
     if name == "video:video_codec":
@@ -258,7 +258,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen the range to include the current value, which shows that this drone allows more than is documented."""
+    """Widen the range to include the current value, which proves that this drone allows more than is documented."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))
@@ -272,7 +272,7 @@ def _widened(parameter: Parameter) -> Parameter:
 
 # Commands that are not actions ---------------------------------------------------------------------------------------
 
-#: Sends a command in each of a number of ticks.
+#: Sends a command in each of a given number of ticks.
 Send = Callable[[AtMessage, int], None]
 
 _REPEATS: Final = 3

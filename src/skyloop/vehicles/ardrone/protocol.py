@@ -169,9 +169,9 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even in a gap too short to count as a lost link.
+        """Detect that the drone restarted or lost contact with us, even if the gap was too short to be a lost link.
 
-        The drone may have lost its set-up in the process. Two consecutive datagrams must show the change.
+        The drone may have lost its set-up in the process. Two consecutive datagrams must report the change.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state
@@ -236,7 +236,7 @@ class ArdroneSession(VehicleSession):
     def _check_deafness(self, now_ns: int) -> None:
         """Restart the sequence if the watchdog bit stays set.
 
-        The drone clears the bit when it accepts commands. If the bit stays set, its count may be ahead of ours.
+        The drone clears the bit when it accepts commands. If the bit stays set, the drone's count may be ahead of ours.
         """
         if self._deaf_since_ns is None:
             self._deaf_since_ns = now_ns

@@ -1,9 +1,9 @@
 """Convert set-points to ``REF`` and ``PCMD``, tick by tick. Pure.
 
-``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
-emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps it
-set until navdata shows the change. It is toggled again only if navdata made later by the drone still shows no effect,
-because one toggle too many would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
+``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata reports the new state. The
+emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps
+the bit set until navdata confirms the change. It is toggled again only if navdata created later still shows no effect,
+because an extra toggle would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
 climb (positive up) and yaw rate (positive clockwise), each from -1 to 1 as a fraction of the limit set in the drone.
 """
 
@@ -49,7 +49,7 @@ class StickLimits:
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """The four values of ``PCMD``, each from -1 to 1, with the signs used there."""
+    """The four values of ``PCMD``, each from -1 to 1, with that command's signs."""
 
     roll: float
     pitch: float
@@ -105,8 +105,8 @@ def _share(value: float, limit: float) -> float:
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still on the ground is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which a rise is ours, not another program's
-#: Navdata shows the effect of the emergency bit within this time, whether by the drone's clock or by ours.
+RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after sending a take-off is ours, not another program's
+#: Navdata reports the effect of the emergency bit within this time, measured by the drone's clock or by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
@@ -161,7 +161,7 @@ class SetpointController:
 
     def __init__(self) -> None:
         self.condition: Condition | None = None  #: according to the newest navdata; None while the drone is silent
-        self.limits: StickLimits | None = None  #: None until they have been read
+        self.limits: StickLimits | None = None  #: None until the limits have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
         self._decision = Decision.STAY
@@ -169,7 +169,7 @@ class SetpointController:
         self._landing_is_ours = False
         self._decided_ns = 0
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
-        self._releasing = False  # whether a reset was requested that does not show in navdata yet
+        self._releasing = False  # whether a requested reset is not visible in navdata yet
         self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
         self._bit_due = False  # whether to set the bit next, regardless of navdata
@@ -277,7 +277,7 @@ class SetpointController:
         """Handle the newest navdata.
 
         ``passed_ns`` is the drone's own time since the previous navdata; None if it equals the time that passed here.
-        This tells delayed navdata, which arrives in a burst, from new navdata.
+        This distinguishes delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
@@ -338,7 +338,7 @@ class SetpointController:
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
     def _ask_bit(self, now_ns: int) -> None:
-        self._bit_due = not self._bit  # if it is already set, wait for its effect
+        self._bit_due = not self._bit  # if the bit is already set, wait for its effect
         self._on_bit(now_ns)
 
     def _on_bit(self, now_ns: int) -> None:
@@ -354,7 +354,7 @@ class SetpointController:
         if not wanted:
             self._bit = self._bit_due = False
         elif before and without_effect:
-            self._bit, self._bit_due = False, True  # clear it for one tick to create another edge
+            self._bit, self._bit_due = False, True  # clear it for one tick, so that setting it creates another edge
         elif self._bit_due or without_effect:
             self._bit, self._bit_due = True, False
         if self._bit is not before:
@@ -376,7 +376,7 @@ class SetpointController:
         if self.condition is None:
             return None  # leave the drone as it is
         if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
-            return None  # it may have landed and would take off again
+            return None  # the drone may have landed and would take off again
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         lands = by_itself or (self._landing_is_ours and self.condition.touches_down)
         return Ref.TAKEOFF if self.condition.flying and not lands else Ref(0)

@@ -35,7 +35,7 @@ from skyloop.vehicles.ardrone.wire.navdata import (
 
 # Reception -----------------------------------------------------------------------------------------------------------
 
-#: Period of the drone's datagrams in demo mode (True, as before its set-up) and with all options (False).
+#: Period of the drone's datagrams: in demo mode, as before its set-up (True), and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: gap after which a lower number means a restart, not a late datagram
 _MICROSECOND_BITS: Final = 21
@@ -74,7 +74,7 @@ class Reception:
         return navdata
 
     def expect_restart(self) -> None:
-        """Accept any sequence number next, because the drone was silent or lost us."""
+        """Accept any sequence number next, because the drone was silent or lost contact with us."""
         self._accepted_ns = 0
 
     def telemetry(self) -> dict[str, Value]:
@@ -99,8 +99,8 @@ class Reception:
 class DroneClock:
     """Determines the capture time of a datagram's state on this host's clock.
 
-    Without the option ``time``, this is when the datagram arrived; with it, the drone's stamps corrected by the
-    smallest recent delay. Times never go backwards.
+    Without the option ``time``, this is the datagram's arrival time; with it, this is the drone's stamp corrected by
+    the smallest recent delay. Times never go backwards.
     """
 
     def __init__(self) -> None:

@@ -153,7 +153,7 @@ class DatagramPort:
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram. As usual with UDP, it is lost if the buffer is full or there is no receiver."""
+        """Send a datagram. As usual with UDP, the datagram is lost if the buffer is full or there is no receiver."""
         for each in self._outward.packets(datagram):
             self._later(partial(self._send, each, to))
 
@@ -207,7 +207,7 @@ _BUFFER: Final = 1 << 16
 
 
 class ByteServer:
-    """Serves one client at a time. Meanwhile the next one waits in the kernel's backlog, connected but unanswered.
+    """Serves one client at a time. Meanwhile, the next client stays connected but unanswered in the kernel's backlog.
 
     Use only on the loop's thread.
     """
@@ -326,7 +326,7 @@ class RunningEmulator(ABC):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Store the drone's newest estimate for the loop's thread, replacing one not yet handled."""
+        """Store the drone's newest estimate for the loop's thread, replacing any that has not been handled yet."""
         self._report = report
         if not self._posted:
             self._posted = True

@@ -88,7 +88,7 @@ class Packer(Protocol[S_contra]):
 class VideoEncoding(Generic[S]):
     """Encodes on a separate thread. Of the images that arrive during encoding, only the newest is kept.
 
-    ``packer`` is used and ``send`` called, with each encoded image, only on that thread; ``settings`` on any.
+    Only that thread uses ``packer`` and calls ``send`` with each encoded image; any thread may call ``settings``.
     """
 
     def __init__(self, packer: Packer[S], settings: Callable[[], S], send: Callable[[Piece], None]) -> None:

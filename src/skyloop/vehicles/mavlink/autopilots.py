@@ -122,7 +122,7 @@ class AutopilotProfile(ABC):
     TAKING_OFF: ClassVar[frozenset[str]]
     NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that are flown with a remote control
     LEAD_S: ClassVar[float]  #: how long set-points must arrive before the vehicle enters GUIDED
-    BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if its capabilities do not say
+    BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if the capabilities do not specify it
     EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that it uses to convert latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
@@ -155,7 +155,7 @@ class AutopilotProfile(ABC):
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
         """Return a diagnostic for each safety net for which this autopilot has a parameter.
 
-        By default, both autopilots only stop following the last set-point if this computer or its link fails.
+        By default, if this computer or its link fails, both autopilots merely stop following the last set-point.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 
@@ -228,7 +228,7 @@ class ArduCopterProfile(AutopilotProfile):
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:
-        """Return diagnostics for the safety nets, and for whether the vehicle monitors our heartbeats."""
+        """Return diagnostics for the safety nets and for the vehicle's monitoring of our heartbeats."""
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
@@ -297,7 +297,7 @@ class Px4Profile(AutopilotProfile):
         """Return whether the vehicle can be armed; None while it does not report that.
 
         PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
-        allow arming, such as one left over from a flight, the outcome does not apply to the mode in which a take-off
+        allow arming (it may be left over from a flight), the outcome does not apply to the mode in which a take-off
         begins. In that case only the position estimate is checked.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)

@@ -24,9 +24,9 @@ POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
 ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitude set-points, each with a new heading in a turn: 50 Hz
-MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
+MOST_YAW_LEAD_RAD: Final = 0.5  #: maximum lead of the requested heading over a vehicle that can't keep up
 STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
-STOPPING_S: Final = 3.0  #: time after which it holds its position in any case
+STOPPING_S: Final = 3.0  #: time after which the vehicle holds its position in any case
 MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, used after a pause in the ticks
 WAY_M_S: Final = 1.0  #: default speed to a position
 WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
@@ -196,7 +196,7 @@ ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted w
 LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
-CUT_SHORT: Final = 0.5  #: fraction of its height below which a hold means that another operator stopped a take-off
+CUT_SHORT: Final = 0.5  #: a hold below this fraction of its height means that another operator stopped a take-off
 CUT_SHORT_M: Final = 1.05  #: minimum shortfall for that: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
 STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
@@ -206,8 +206,8 @@ class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
     Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request;
-    ``disarms`` says whether the vehicle was found armed and our unfinished landing may still disarm it.
+    own words, and refused steps are retried for as long as the take-off is requested. ``asked_ns`` is the time of the
+    last request; ``disarms`` is whether the vehicle was found armed and our unfinished landing may still disarm it.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
@@ -215,7 +215,7 @@ class TakeoffSequence:
         self.done = False
         self.given_up = ""  #: why the take-off was given up; empty if it was not
         self.taken_over = False  #: whether another operator chose a mode in the air
-        self.declined = False  #: whether it was given up because another operator chose a mode before it was armed
+        self.declined = False  #: whether the take-off was given up because another operator chose a mode before arming
         self.rose = False  #: whether the vehicle has left the ground
         self.lead_ns: int | None = None  #: when set-points began to be sent
         self.reason = ""  #: the vehicle's own reason for refusing to arm
@@ -223,7 +223,7 @@ class TakeoffSequence:
         self._height_m = height_m
         self._begun_ns = now_ns
         self._disarms = disarms
-        self._armed_ns: int | None = None  # when it was first seen armed, or arming was acknowledged
+        self._armed_ns: int | None = None  # when the vehicle was first seen armed or acknowledged arming
         self._climb_command: VehicleCommand | None = None
         self._best_m = -1.0
         self._best_ns = now_ns
@@ -233,8 +233,8 @@ class TakeoffSequence:
         self._other_ns: int | None = None
         self._sent_ns = 0
         self._seen = not autopilot.TAKING_OFF  # whether its take-off mode, if it has one, was seen
-        self.refused = ""  #: why it is not armed yet
-        self.arm_asked_ns: int | None = None  #: when arming was last requested; None if it was already armed
+        self.refused = ""  #: why the vehicle is not armed yet
+        self.arm_asked_ns: int | None = None  #: when arming was last requested; None if the vehicle was already armed
         self._arming_ns: int | None = None  # first arming request; earlier replies belong to the landing's disarming
         self._ready = False  # was in take-off mode, armed or about to be: any other mode is another operator's choice
 

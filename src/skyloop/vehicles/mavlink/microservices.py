@@ -21,7 +21,7 @@ from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
-MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
+MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported: a hostile sender can invent any number of them
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
 #: MAV_TYPE of each kind of aircraft that hovers on several rotors.
@@ -49,7 +49,7 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen one, which may have moved there
+        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen vehicle, which may have moved there
         self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, heard from at the same time
         self._received_ns = 0  # when the chosen vehicle was last heard from
 
@@ -287,7 +287,7 @@ class VehicleClock:
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
-        """Return when the stamped state was captured, never later than it arrived nor earlier than the previous one."""
+        """Return the capture time of the stamped state, limited to between the previous capture time and arrival."""
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns

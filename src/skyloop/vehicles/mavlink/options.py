@@ -165,7 +165,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
 
 
 def address_of(uri: VehicleUri) -> Address:
-    """Parse the part of an address that says where the vehicle is."""
+    """Parse the part of an address that specifies how to reach the vehicle."""
     word, _, rest = uri.place.partition(":")
     if word not in [kind.value for kind in ConnectionKind]:
         raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")

@@ -45,7 +45,7 @@ class _PendingWrite:
 
 
 class ParameterExchange:
-    """Reads and writes one vehicle's parameters. ``bytewise`` says whether integers are encoded bytewise."""
+    """Reads and writes one vehicle's parameters. ``bytewise``: whether integers are encoded bytewise."""
 
     def __init__(self) -> None:
         self.target = (1, 1)
@@ -137,7 +137,7 @@ class ParameterExchange:
                 kind = self.reported[write.name].kind
                 try:
                     field = to_field(write.value, kind, bytewise=self.bytewise)
-                except struct.error as error:  # its type has changed since the request
+                except struct.error as error:  # the parameter's type has changed since the request
                     self._writes.remove(write)
                     write.done(f"{write.value:g} does not fit: {error}")
                     continue
@@ -289,7 +289,7 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
     else:
         least, most = -math.inf, math.inf
         value, kind = rounded(held.value), ParameterType.FLOAT
-    # A value outside the range shows that the vehicle's own range is wider.
+    # A reported value outside this range means that the vehicle itself allows a wider range.
     low = _bound(min(meaning.low if meaning.low is not None else least, value))
     high = _bound(max(meaning.high if meaning.high is not None else most, value))
     text = meaning.text or f"the autopilot's {held.name}"

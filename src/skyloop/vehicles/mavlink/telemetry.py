@@ -36,11 +36,11 @@ class VehicleState:
     position: Vector | None  #: position relative to its origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
-    altitude_m: float | None  #: height above its start, or the closest equivalent that it reports
+    altitude_m: float | None  #: height above the vehicle's start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
-    remote: bool = False  #: whether it reports that it receives a remote control
+    remote: bool = False  #: whether the vehicle reports that it receives a remote control
     heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which says whether it is armed
-    reports_landed: bool = False  #: whether it has ever reported whether it is on the ground
+    reports_landed: bool = False  #: whether the vehicle has ever reported being on the ground or in the air
 
     @property
     def airborne(self) -> bool | None:
@@ -164,7 +164,7 @@ class Telemetry:
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix and both positions.
+        """Return the position on Earth of the axes' origin; None without a 3-D satellite fix and both positions.
 
         Without a fix, an autopilot's origin may be arbitrary, as with motion capture.
         """
@@ -199,7 +199,7 @@ class Telemetry:
         return None if message is None else message.alt / 1000.0
 
     def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
-        """Return the vehicle's state; ``ready`` says whether it can be armed, None if unknown."""
+        """Return the vehicle's state; ``ready`` is whether the vehicle can be armed, or None if that is unknown."""
         attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
@@ -364,7 +364,7 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until it is reported airborne (PX4: once per second)
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until the vehicle reports it (PX4: once per second)
 
 
 class HealthMonitor:
@@ -374,7 +374,7 @@ class HealthMonitor:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
         self._reasons: set[str] = set()  # reasons for refusing to arm, already reported during this boot
-        self._airborne_ns: int | None = None  # when it took off
+        self._airborne_ns: int | None = None  # when the vehicle took off
 
     @property
     def was_ready(self) -> bool:
@@ -418,7 +418,7 @@ class HealthMonitor:
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
-                # PX4 reports a constant position while on the ground; in the air that means the position is lost.
+                # PX4 reports a constant position while on the ground; in the air that means that the position is lost.
                 counts = kind != "ESTIMATOR_STATUS" or risen
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
                 events += self._changed(

@@ -96,7 +96,7 @@ class Setup:
 
     @property
     def aux_channels(self) -> int:
-        """The number of AUX channels to send; the firmware itself would choose the value of any missing one."""
+        """The number of AUX channels to send; the firmware would choose its own value for any missing channel."""
         used = max((each.aux + 1 for each in self.ranges), default=0)
         return min(MOST_AUX, max(LEAST_AUX, used))
 

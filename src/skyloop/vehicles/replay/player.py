@@ -1,6 +1,6 @@
 """Players for recordings: on a thread in real time, or sample by sample for a caller that advances the time.
 
-The vehicle's samples are published unchanged; those of the recorded proxy become messages about the past. Viewers set
+The vehicle's samples are published unchanged; the recorded proxy's samples become messages about the past. Viewers set
 position, speed and pause through parameters.
 """
 
@@ -156,7 +156,7 @@ class Playback:
         """Return what the player should do now; each position is returned only once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
-            if wanted.position_s is not None:  # the client that wrote it may read it back before that moment is shown
+            if wanted.position_s is not None:  # clients may read it back before that moment is shown
                 self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()
@@ -175,7 +175,7 @@ class Playback:
 
 # Publishing ----------------------------------------------------------------------------------------------------------
 
-#: Events from the vehicle itself. All others came from the recorded proxy or an application, and clients must not
+#: Events from the vehicle itself. All other events came from the recorded proxy or an application, and clients must not
 #: mistake them for events about their own authority or commands.
 _VEHICLES_OWN: Final = frozenset({EventKind.COLLISION, EventKind.VEHICLE_MESSAGE, EventKind.DRIVER_ERROR})
 #: Events that the replay's own proxy emits itself.
@@ -339,7 +339,7 @@ def described(applied: Applied) -> dict[str, Value]:
 
 
 def numbers(action: AnyAction) -> tuple[float, ...]:
-    """Return an action's numbers in field order, with NaN for a missing one such as a position's yaw."""
+    """Return an action's numbers in field order, with NaN for a missing number such as a position's yaw."""
     given = (getattr(action, name) for name in action.__struct_fields__)
     return tuple(math.nan if number is None else float(number) for number in given)
 
@@ -518,7 +518,7 @@ class StepPlayer:
         self._next = next(self._samples, None)
 
     def step(self) -> None:
-        """Publish the next sample, whose time has come. After the last sample, close the link."""
+        """Publish the next sample, which is now due. After the last sample, close the link."""
         sample = self._next
         if sample is None:
             raise UsageError("the recording is over")

@@ -49,8 +49,8 @@ class Moment:
         return self.state is not None and found.issuperset(cameras)
 
 
-#: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
-#: has an image. A camera with no image in them shows nothing.
+#: Numbers of parts of the file (about half a second each) to read before the time sought. They are tried in turn until
+#: each camera has an image. A camera that has no image in any of these parts stays blank.
 _PARTS_BEFORE: Final = (1, 4, 16)
 _KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
 

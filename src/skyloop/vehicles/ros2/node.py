@@ -33,7 +33,7 @@ _FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS
 MOST_DOMAIN: Final = 101  #: maximum domain: above it, outgoing connections on Linux may occupy DDS's ports
 SHARED_BYTES: Final = 16 * 2**20  #: shared memory per participant: several images; the default 512 KiB is too small
 
-#: A profile for Fast DDS: sockets only on loopback, and shared memory with room for images.
+#: A profile for Fast DDS: sockets only on loopback, and shared memory large enough for images.
 LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com">
   <profiles>
@@ -106,7 +106,7 @@ def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
 
 
 def domain_of(text: str | None) -> int | None:
-    """Parse a domain; None if there is no text, in which case ROS 2 uses ``ROS_DOMAIN_ID``."""
+    """Parse a domain; return None if there is no text, in which case ROS 2 uses ``ROS_DOMAIN_ID``."""
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):

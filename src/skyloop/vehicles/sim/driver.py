@@ -60,7 +60,7 @@ class SimDriver(Driver):
     axes. ``sim.time_s`` is the simulation's own time.
 
     With ``autopilot`` in the address, real firmware flies the drone. Capabilities, feedback and most parameters are
-    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else is as for any simulated drone.
+    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else works as for any simulated drone.
     See ``docs/autopilots.md``.
 
     Args:
@@ -242,7 +242,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio on or off. Like a real drone, it holds its position without reception."""
+        """Switch the simulated radio on or off. Like a real drone, it holds its position while it receives nothing."""
         sink = self._sink
         if sink is None:
             return

@@ -47,8 +47,8 @@ _NAMES: Final = {
 _ERRORS: Final = (FirmwareEventKind.SILENT, FirmwareEventKind.DIED, FirmwareEventKind.FAILED)
 _KEPT_REPORTS: Final = 64  # number of reports kept, to find the truth at the time of delayed feedback
 _POSE_STD_M: Final = 0.001  # standard deviation reported for the true position
-#: Maximum age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
-#: time, so is the firmware's clock; its driver trusts that clock and would report a greater age.
+#: Maximum age of the firmware's reported state, which arrives over loopback. If the simulation runs slower than real
+#: time, so does the firmware's clock; the driver trusts that clock and would report a greater age.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 

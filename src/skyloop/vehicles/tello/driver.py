@@ -95,7 +95,7 @@ class TelloDriver(Driver):
             return link.session.diagnose()
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters. Those that depend on the SDK version appear once that is known."""
+        """Return the parameters. Parameters that depend on the SDK version appear once the version is known."""
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:

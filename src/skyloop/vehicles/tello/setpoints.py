@@ -118,7 +118,7 @@ class SetpointController:
         self._sent_ns: int | None = None  # when the take-off or landing was sent
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._state_ns = 0  # when the last state arrived
-        self._was_in_air = False  # whether the last state said so, or we have just sent a take-off
+        self._was_in_air = False  # whether the last state was in the air, or we have just sent a take-off
         self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
         self._events: list[VehicleEvent] = []
 
@@ -142,7 +142,7 @@ class SetpointController:
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return FlightState.LANDING  # it may be about to rise
+            return FlightState.LANDING  # the drone may be about to rise
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
         return self.watch.phase
@@ -265,7 +265,7 @@ class SetpointController:
             self._events.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
 
     def lost(self, now_ns: int) -> None:
-        """Cancel a take-off and level the sticks after a link loss. A landing is still sent."""
+        """Cancel a take-off and level the sticks after a link loss. A landing command is still sent."""
         self.receiving = False
         self._was_in_air |= now_ns < self._rises_until_ns
         if self._decision is Decision.TAKE_OFF:

@@ -24,7 +24,7 @@ STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 
 
 def height_m(state: State) -> float | None:
-    """Return the measured height above the surface below [m] or, if there is none, that above the take-off point.
+    """Return the height [m]: as measured above the surface below or, without a measurement, above the take-off point.
 
     The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells them apart.
     """
@@ -100,8 +100,8 @@ _S = FlightState
 class FlightWatch:
     """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
 
-    ``rising`` and ``sinking`` mean that a take-off or landing was requested and is not complete, ``landing_answered``
-    that the drone has replied that it landed.
+    ``rising`` and ``sinking`` mean that a take-off or landing was requested and is not complete; ``landing_answered``
+    means that the drone has replied that it landed.
     """
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class FlightWatch:
         return _S.HOVERING
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
-        """Return whether a landed drone has taken off. Being carried around does not count."""
+        """Return whether a landed drone has taken off. Carrying the drone around does not count as a take-off."""
         begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before the landing
         if self.rising and (high or (motors and begun)):
             return True

@@ -11,8 +11,8 @@ positive pitch is nose up, positive roll right side down, positive yaw clockwise
 attitude and acceleration: a Tello that reports a pitch of 8° reports 0.116 g along x.
 
 Video is H.264 in Annex B form, divided into pieces of 1460 bytes without headers or numbers. A piece shorter than the
-others ends an image, and one that begins with a start code begins the next. If a piece is lost in the middle of an
-image, only the decoder notices.
+others ends an image, and a piece that begins with a start code begins the next image. If a piece is lost in the middle
+of an image, only the decoder notices.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SILENCE_S: Final = 15.0  #: time without a command after which the Tello lands
 
 ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100
-#: Effect of a stick at 100; an estimate, because no guide gives it. Users take ``rc`` to be in cm/s and degrees/s.
+#: Effect of a stick at 100; an estimate, because no guide gives it. Users assume that ``rc`` is in cm/s and degrees/s.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
@@ -235,7 +235,7 @@ PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 or 0 if none is in view; some firmware then sends 257
+    if number is None or number not in PADS:  # -1 or 0 if no pad is in view; some firmware sends 257 instead
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -248,7 +248,7 @@ def build(fields: list[tuple[str, str]]) -> bytes:
 
 
 PIECE: Final = 1460  #: size of every datagram of an image except the last [bytes]
-MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real ones have a fiftieth of that
+MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real images have a fiftieth of that
 _SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
@@ -341,7 +341,7 @@ class Assembly:
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
-        """Return whether this image's number does not follow the previous one, and store the number."""
+        """Store this image's number; return True unless it directly follows the previous image's number."""
         try:
             for unit in head:
                 if h264.unit_type(unit) == h264.SPS:

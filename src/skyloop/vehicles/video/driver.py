@@ -55,7 +55,7 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. A file's head is read once to determine its image size; a live camera is not opened."""
+        """Return the camera. A file's start is read once to determine its image size; a live camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),

@@ -145,7 +145,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure [ms], None for automatic; return why that failed, as readable text."""
+        """Set the exposure [ms], or automatic exposure for None; return the reason for a failure as readable text."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -159,7 +159,7 @@ class V4l2Device:
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:
-        """Set the gain in the device's own unit, None for automatic; return why that failed, as readable text."""
+        """Set the gain in the device's own unit, or automatic gain for None; return a readable reason for a failure."""
         if gain is None:
             problem = self._set(AUTO_GAIN, 1)
             return f"the camera has no automatic gain: {problem}" if problem else ""

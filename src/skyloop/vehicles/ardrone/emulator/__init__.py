@@ -1,4 +1,4 @@
-"""An emulated AR.Drone 1 or 2 on the network, flying a simulated vehicle, for any program that flies the real one.
+"""An emulated AR.Drone 1 or 2 on the network that flies a simulated vehicle and accepts any program for the real drone.
 
 To use it on free local ports, as in a test::
 
@@ -85,7 +85,7 @@ MOST: Final = 8  #: maximum number of recipients of datagrams
 class Listeners:
     """Recipients' addresses, each with its own sequence.
 
-    There are at most :data:`MOST`; a further one replaces the one that has made no request for longest. As with the
+    There are at most :data:`MOST` recipients; a new one replaces the one whose last request is the oldest. As with the
     real drone, requests need not be repeated.
     """
 
@@ -120,8 +120,8 @@ _READ: Final = 4096
 class Outlet:
     """The connection to one client.
 
-    A client that reads too slowly loses whole pieces of the stream, from the first one that does not fit until the next
-    one that can be decoded without its predecessors.
+    A client that reads too slowly loses whole pieces of the stream, from the first piece that does not fit up to the
+    next piece that can be decoded on its own.
     """
 
     def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
@@ -413,7 +413,7 @@ VERSIONS: Final = (1, 2)
 
 
 class ArdroneFirmware(Emulator[RunningFirmware]):
-    """The firmware of one drone in a host's world. Several can share a host, each with its own drone and ports.
+    """The firmware of one drone in a host's world. Several drones can share a host, each with its own ports.
 
     Create the host with options from :func:`with_ardrones`. Full navdata is sent at the host's report rate
     (:attr:`skyloop.sim.options.SimOptions.rate_hz`), but at 125 Hz at most; real drones send it at 200 Hz.
@@ -427,9 +427,9 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
         delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
-        torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
-            client, however old, and then the frames that follow, key frames or not. Otherwise its stream begins with
-            the next key frame.
+        torn_start: Whether a new video client first gets the last frame sent to another client, however old, and then
+            the frames that follow, key frames or not. A real AR.Drone 2 does this. Otherwise its stream begins with the
+            next key frame.
 
     Raises:
         UsageError: The version or header size is unknown, or the delay is out of range.
@@ -465,7 +465,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The actual ports, including those chosen where 0 was given."""
+        """The actual ports, including those that the system chose for 0."""
         return self._started.ports
 
     @property

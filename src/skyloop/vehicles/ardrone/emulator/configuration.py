@@ -55,8 +55,8 @@ _CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each cha
 class Configuration:
     """All keys of an AR.Drone 1 or 2. Ignores invalid values received from clients and never raises.
 
-    A number out of range is clamped; no source says what the drone does with it. A key in the category session, user
-    or application has a separate value for each id; new ids begin with the factory values.
+    A number out of range is clamped; no source says what a real drone does in that case. A key in the category session,
+    user or application has a separate value for each id; new ids begin with the factory values.
     """
 
     def __init__(self, version: int) -> None:

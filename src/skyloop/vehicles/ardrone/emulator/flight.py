@@ -168,12 +168,12 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: use the current attitude as level. Refused in the air."""
+        """Handle ``FTRIM``: use the current attitude as level. The request is refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
     def calibrate(self, device: int, now_ns: int) -> None:
-        """Handle ``CALIB``: turn once on the spot. Refused on the ground, and by an AR.Drone 1."""
+        """Handle ``CALIB``: turn once on the spot. Refused on the ground, and always by an AR.Drone 1."""
         if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
             return
         self.calibrations += 1
@@ -196,7 +196,7 @@ class FlightControl:
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Check the battery, the angles and, by the time since the last command, the link. Called regularly."""
+        """Check the battery, the angles, and the link (from the time since the last command). Called regularly."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:
@@ -223,7 +223,7 @@ class FlightControl:
         elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
             self._emergency = State(0)
             self._toggle_ready = False
-        # A reset during the fall is ignored. It takes effect on the ground if the bit is still set.
+        # A reset during the fall is ignored. The reset takes effect on the ground if the emergency bit is still set.
 
     def _watch_battery(self, believed: VehicleFeedback) -> None:
         least_mv = self._configuration.number("general:vbat_min")

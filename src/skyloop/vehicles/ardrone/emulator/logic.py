@@ -27,7 +27,7 @@ class CommandSequence:
 
     After two seconds without an accepted command, any number greater than 0 is accepted. The Developer Guide says that
     clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost,
-    so this one does not.
+    so the emulated drone does not insist on it.
     """
 
     def __init__(self) -> None:

@@ -93,8 +93,8 @@ def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
 def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
     """Return the tags of the options to send, in ascending order, for the mask ``general:navdata_options``.
 
-    In demo mode these are the tags in the default mask and in the configured one. In full mode they are those in the
-    configured mask or, if it is still the default, all of them: real drones send all to programs that never set it.
+    In demo mode, these are the tags in the default and the configured mask. In full mode, these are the tags in the
+    configured mask, or all tags if that is the default mask: real drones send all options to clients that never set it.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL

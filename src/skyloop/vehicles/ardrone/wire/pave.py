@@ -188,7 +188,7 @@ class PaveParser:
         return False
 
     def _is_followed_well(self, header: _Header) -> bool:
-        """Return whether another frame begins right after this one; if not, some bytes of this one are wrong."""
+        """Return whether another frame begins right after this one; if not, some bytes of this frame are wrong."""
         end = header.size + header.payload_size
         return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 

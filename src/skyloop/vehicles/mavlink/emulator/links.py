@@ -33,7 +33,7 @@ class Ports:
 
     udp: int  #: the autopilot's own UDP port, which sends to ``remote`` until a message arrives
     remote: int  #: UDP port of the other end
-    tcp: int | None = None  #: port of the TCP server for one client; None if it has none
+    tcp: int | None = None  #: port of the TCP server for one client; None if there is no server
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:
@@ -147,7 +147,7 @@ class Streams:
         return -1 if period_s is None else round(period_s * 1e6)
 
     def due(self, time_s: float) -> list[int]:
-        """Return the messages to send now, each only once, however late it is."""
+        """Return the messages to send now: each is returned only once, however late the call is."""
         found = []
         for number, period_s in self._periods.items():
             due_s = self._due[number]

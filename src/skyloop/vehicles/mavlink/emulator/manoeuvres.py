@@ -198,7 +198,7 @@ class Manoeuvres:
         return up >= self._rise_m - 0.1
 
     def begin_return(self, home: Vector, height_m: float, *, wait_s: float = 0.0, final_m: float | None = None) -> None:
-        """Start returning: climb, fly to ``home`` at that height, or as high as it can, wait there, and land.
+        """Start returning: climb, fly to ``home`` at that height (or as high as possible), wait there, and land.
 
         ``final_m`` is the height to descend to instead of landing; None to land.
         """

@@ -22,7 +22,7 @@ REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
 #: Estimator flags for a known position: relative and absolute, each current and predicted for flight. DroneKit waits
-#: for the last one.
+#: for the last flag.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
 POSES_S: Final = 1.0  #: how long external poses must arrive before the position is known without GPS
 POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
@@ -70,7 +70,7 @@ class AutopilotState(ABC):
 
     @property
     def has_origin(self) -> bool:
-        """Whether it has a position."""
+        """Whether the autopilot has a position."""
         if self.gps:
             return self.time_s >= self._boot_s / 2
         return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
@@ -82,17 +82,17 @@ class AutopilotState(ABC):
 
     @property
     def ready(self) -> bool:
-        """Whether it can be armed."""
+        """Whether the autopilot can be armed."""
         return self.settled and self.mode_allows_arming
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its present mode."""
+        """Whether the autopilot can be armed in its present mode."""
         return True
 
     @property
     def remote(self) -> bool:
-        """Whether it reports that it receives a remote control."""
+        """Whether the autopilot reports that it receives a remote control."""
         return False
 
     @property
@@ -113,7 +113,7 @@ class AutopilotState(ABC):
 
     @property
     def channels(self) -> list[int] | None:
-        """The remote control's pulse widths [µs]; None if it reports none."""
+        """The remote control's pulse widths [µs]; None if none are reported."""
         return None
 
 

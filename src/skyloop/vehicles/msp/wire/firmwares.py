@@ -115,7 +115,7 @@ def share_of(curve: Curve) -> Curve:
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, for a value; full stick if the value can't be reached."""
+    """Return the stick position, -1 to 1, for a value; full stick if the value can't be reached."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:
@@ -195,7 +195,7 @@ ARM: Final = "ARM"
 ANGLE: Final = "ANGLE"
 PREARM: Final = "PREARM"
 MSP_OVERRIDE: Final = ("MSP OVERRIDE", "MSP RC OVERRIDE")  #: Betaflight's and INAV's names
-ARMED_OF_INAV: Final = 1 << 2  #: bit in the flags of INAV's status that means armed
+ARMED_OF_INAV: Final = 1 << 2  #: bit in INAV's status flags that means "armed"
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:

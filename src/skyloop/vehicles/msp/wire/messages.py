@@ -169,7 +169,7 @@ class Status:
         """Read ``INAV_STATUS``. Raises :class:`DecodeError`."""
         cycle, _, sensors, load, _, flags = _unpack(_INAV_STATUS, payload, "INAV_STATUS")
         rest = payload[_INAV_STATUS.size : _INAV_STATUS.size + 16]
-        if len(rest) % 4 == 1:  # the mixer profile follows the modes
+        if len(rest) % 4 == 1:  # the byte after the modes is the mixer profile
             rest = rest[:-1]
         return cls(sensors, int.from_bytes(rest, "little"), flags, 32, cycle, load)
 
@@ -298,7 +298,7 @@ class Gps:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw sensor values. Only the gyroscope's have the same unit on every board: degrees per second."""
+    """Raw sensor values. Only the gyroscope's readings have the same unit on every board: degrees per second."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]

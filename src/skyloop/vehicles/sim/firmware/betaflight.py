@@ -137,8 +137,8 @@ MAX_TEXT: Final = 4096
 
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
-#: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without sticks it
-#: flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
+#: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without stick
+#: commands, Betaflight flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
@@ -154,14 +154,14 @@ SETTINGS: Final = (
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
-#: Time allowed for the first reply after startup. Normally it takes 0.8 s; in one start out of ten the firmware never
-#: replies, because of a race between its threads.
+#: Time allowed for the first reply after startup. Normally the reply takes 0.8 s; in one start out of ten the firmware
+#: never replies, because of a race between its threads.
 ANSWER_S: Final = 1.5
 LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each failed start in case the computer is busy
 #: Time allowed for the flight control loop's first run, which ends BOOTGRACE (5 s with an earlier version's settings).
 #: If the scheduler drops that loop, the firmware replies but can never be armed.
 FLIGHT_CONTROL_S: Final = 8.0
-START_S: Final = 5.0  #: longest time from process start until it first sends motor outputs
+START_S: Final = 5.0  #: longest time from process start until the firmware first sends motor outputs
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
 
@@ -188,7 +188,7 @@ class Betaflight(CoupledFirmware):
 
     @property
     def address(self) -> str:
-        """Its first serial port over TCP. Betaflight's Configurator can use the second, ``tcp://127.0.0.1:5762``."""
+        """The first serial port, over TCP. Betaflight's Configurator can use the second, ``tcp://127.0.0.1:5762``."""
         return f"msp://tcp:{LOOPBACK}:{self._msp_port}"
 
     @property
@@ -260,7 +260,7 @@ class Betaflight(CoupledFirmware):
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
                 raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
-        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment for the next
+        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment before the next
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
@@ -337,7 +337,7 @@ class Betaflight(CoupledFirmware):
 
 
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
-    """Connect to a serial port that opens soon; return once ``words`` get a reply that contains ``answer``.
+    """Connect to a serial port that is about to open; return once ``words`` get a reply that contains ``answer``.
 
     Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if there
     was no connection within ``within_s``.

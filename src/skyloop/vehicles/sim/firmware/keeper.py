@@ -1,9 +1,9 @@
 """Run flight firmware as the only child process, and end it when the parent of this process ends.
 
 ``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …`` writes
-the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives it priority,
-``--apart`` a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the firmware's or, as in
-a shell, 128 plus the number of the signal that ended it.
+the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives the firmware
+priority; ``--apart`` gives it a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the
+firmware's or, as in a shell, 128 plus the number of the signal that ended it.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 _priority_lock: Final = threading.Lock()  # guards the two variables below, which are process-wide like the niceness
-_prioritizers = 0  # calls of raise_priority() that are not undone
+_prioritizers = 0  # number of raise_priority() calls that have not been undone
 _niceness: Final[dict[int, int]] = {}  # original niceness of each thread whose niceness was changed
 
 
 def become_prompt() -> None:
-    """Make the kernel wake up this process and its children on time, reliably only as root. Never raises.
+    """Make the kernel wake up this process and its children on time, which is reliable only as root. Never raises.
 
     This has an effect only on Linux.
     """
@@ -52,7 +52,7 @@ def become_prompt() -> None:
 def raise_priority() -> None:
     """Prioritize all threads of this process, and those that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as often restores it.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` the same number of times restores it.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:

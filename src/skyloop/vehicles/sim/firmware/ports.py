@@ -70,8 +70,8 @@ def reserve_instance(
 ) -> int:
     """Return the lowest of ``most`` instance numbers whose ports are free, and reserve it within this process.
 
-    ``runs`` says whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError` if
-    no number is free.
+    ``runs`` returns whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError`
+    if no number is free.
     """
     with _lock:
         for instance in range(most):
@@ -122,7 +122,7 @@ class Apart:
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the newest keeper's UDP socket, to be closed by the caller. Raises OSError if there is no new one."""
+        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError without a new socket."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:

@@ -36,11 +36,11 @@ class FirmwareEventKind(StrEnum):
     """Kinds of events that firmware causes."""
 
     STARTED = "started"  #: its process is running
-    ANSWERS = "answers"  #: it is controlling the rotors, for the first time or again
-    SILENT = "silent"  #: it has not replied for a while, so the rotors stop
+    ANSWERS = "answers"  #: the firmware is controlling the rotors, for the first time or again
+    SILENT = "silent"  #: the firmware has not replied for a while, so the rotors stop
     DIED = "died"  #: its process ended and is being restarted
     FAILED = "failed"  #: it could not be started; the start is retried
-    DEAF = "deaf"  #: its process ran but did not reply; another one is started at once
+    DEAF = "deaf"  #: the process ran but did not reply; another process is started at once
 
 
 class StartedInVainError(OSError):
@@ -248,7 +248,7 @@ class CoupledFirmware(ABC):
     NAME: ClassVar[str]  #: the firmware's name in messages
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
-        """Prepare without starting anything.
+        """Prepare to run the firmware, without starting anything.
 
         ``on_event`` is called on the simulation's or the program's thread and must return quickly. ``folder`` is where
         the firmware keeps its settings; None for a new one that is removed at the end.

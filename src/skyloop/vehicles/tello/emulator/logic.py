@@ -3,7 +3,7 @@
 Pure: the clock is an argument, and replies are passed to a function.
 
 Replies that are not in any guide ("error Motor stop", "error Not joystick", "error No valid marker") were reported by
-users. When exactly real firmware sends them has not been verified.
+users. It has not been verified exactly when real firmware sends them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from skyloop.vehicles.tello.wire import (
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
 RISES_WITHIN_S: Final = 0.5  #: simulated time without rising after which take-off was refused for a low battery
-TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although the drone hovered long before
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, but the drone hovered long before it
 FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
 PATIENCE_S: Final = 30.0  #: time after which an unfinished command fails
@@ -191,7 +191,7 @@ def _refusal(sdk: Sdk) -> str:
     return "error" if sdk is Sdk.V1_3 else OUT_OF_RANGE
 
 
-USUAL_SPEED_CM_S: Final = 50  #: speed until ``speed`` sets another one
+USUAL_SPEED_CM_S: Final = 50  #: speed in force until a ``speed`` command changes it
 FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
 SIZES: Final = {"high": (960, 720), "low": (640, 480)}
 _SINCE: Final = {"stop": Sdk.V2_0, "mon": Sdk.V2_0, "moff": Sdk.V2_0, "sdk?": Sdk.V2_0, "sn?": Sdk.V2_0}
