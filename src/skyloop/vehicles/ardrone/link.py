@@ -102,7 +102,7 @@ def _connected(address: str, port: int) -> socket.socket:
 
 
 def _discard(port: socket.socket) -> None:
-    """Discard what the AT port received, which is only errors from the host that the navdata socket reports too."""
+    """Discard data received on the AT port: only errors from the host, which the navdata socket also reports."""
     with suppress(OSError):
         while port.recv(MAX_DATAGRAM):
             pass

@@ -30,7 +30,7 @@ FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes one only if its number exceeds the last; a 1 restarts the count."""
+    """Numbers the commands. A command is executed only if its number exceeds the last one; 1 restarts the count."""
 
     def __init__(self) -> None:
         self._sequence = 0
@@ -266,7 +266,7 @@ class ArdroneSession(VehicleSession):
     def _submit_setup(self, now_ns: int) -> None:
         failed = self._setups_failed
         options = replace(self.options, ids=False) if failed > 1 else self.options
-        # A drone that kept our ids ignores commands without them; one that lost them ignores commands with them.
+        # A drone that kept our ids ignores commands without them; a drone that lost our ids ignores commands with them.
         self.configurator.ids = self._ids if failed % 2 else None
         setup = Setup(options, self.configurator, self._ids, self.remembered)
         done = partial(self._setup_done, setup)

@@ -2,7 +2,7 @@
 
 ``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata reports the new state. The
 emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps
-the bit set until navdata confirms the change. It is toggled again only if navdata created later still shows no effect,
+the bit set until navdata confirms the change. The bit is toggled again only if later navdata still shows no effect,
 because an extra toggle would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
 climb (positive up) and yaw rate (positive clockwise), each from -1 to 1 as a fraction of the limit set in the drone.
 """
@@ -88,8 +88,8 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
 def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
     """Return ``PCMD`` for these stick values; None means hover.
 
-    With a reference, return ``PCMD_MAG``, for which forward and right are relative to that heading (0 magnetic north,
-    positive counter-clockwise) instead of the drone's nose.
+    With a reference, return ``PCMD_MAG``, in which forward and right are relative to that heading (0 magnetic north,
+    positive counter-clockwise) rather than to the drone's nose.
     """
     if stick is None:
         return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))
@@ -170,7 +170,7 @@ class SetpointController:
         self._decided_ns = 0
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._releasing = False  # whether a requested reset is not visible in navdata yet
-        self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
+        self._emergency = False  # whether the newest navdata reports an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
         self._bit_due = False  # whether to set the bit next, regardless of navdata
         self._changed_ns = 0  # when the bit last changed or was requested, or an emergency ended

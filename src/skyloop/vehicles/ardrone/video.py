@@ -2,9 +2,9 @@
 
 An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
 requesting them. The stamps in PaVE headers are the drone's own time in 32-bit milliseconds (``video_encapsulation.h``
-in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. The intrinsics
-for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch) for 640×360 images; other
-drones differ by a few per cent. No intrinsics are known for the AR.Drone 1.
+in the AR.Drone SDK 2.0.1). No source specifies which moment the stamps refer to; the driver assumes the time of
+capture. The intrinsics for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch)
+for 640×360 images; other drones differ by a few per cent. No intrinsics are known for the AR.Drone 1.
 """
 
 from __future__ import annotations

@@ -288,8 +288,8 @@ class RunningEmulator(ABC):
     """Firmware that runs from its construction to :meth:`stop`, which is also called if the constructor fails halfway.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
-    read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, which its
-    creator starts after the firmware and stops before it.
+    read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, whose
+    creator starts it after the firmware and stops it before the firmware.
     """
 
     def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:
@@ -362,7 +362,7 @@ R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone in a host's world. As a context manager, it is switched on within the block."""
+    """The firmware of one drone in a host's world. As a context manager, the firmware is on within the block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host

@@ -160,7 +160,7 @@ class VideoEncoding(Generic[S]):
 
 
 def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a copy of an image with another one, scaled down to (width, height), in its upper left corner."""
+    """Return a copy of an image with another image, scaled down to (width, height), in its upper left corner."""
     width, height = size
     rows = np.arange(height) * other.shape[0] // height
     columns = np.arange(width) * other.shape[1] // width

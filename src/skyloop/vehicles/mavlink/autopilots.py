@@ -123,7 +123,7 @@ class AutopilotProfile(ABC):
     NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that are flown with a remote control
     LEAD_S: ClassVar[float]  #: how long set-points must arrive before the vehicle enters GUIDED
     BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if the capabilities do not specify it
-    EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that it uses to convert latitude and longitude
+    EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that the autopilot uses to convert latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
     @abstractmethod
@@ -138,7 +138,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether a take-off is complete; ``rose``: whether it has been airborne since accepting it."""
+        """Return whether a take-off is complete; ``rose``: whether the vehicle has been airborne since accepting it."""
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
@@ -286,7 +286,7 @@ class Px4Profile(AutopilotProfile):
             return None
         nan = math.nan
         amsl_m = vehicle.amsl_m - (vehicle.altitude_m or 0.0) + height_m
-        # Rounded to decimetres, so that altitude noise on the ground does not turn a repeat into a new command.
+        # The altitude is rounded to decimetres, so that noise on the ground does not turn a repeat into a new command.
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002

@@ -25,7 +25,7 @@ ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust wit
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
 ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitude set-points, each with a new heading in a turn: 50 Hz
 MOST_YAW_LEAD_RAD: Final = 0.5  #: maximum lead of the requested heading over a vehicle that can't keep up
-STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
+STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of following a velocity of zero
 STOPPING_S: Final = 3.0  #: time after which the vehicle holds its position in any case
 MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, used after a pause in the ticks
 WAY_M_S: Final = 1.0  #: default speed to a position
@@ -107,7 +107,7 @@ class PositionSetpoint:
         self.action = action
 
     def hold_back(self) -> None:
-        """Restart from the vehicle's position, because it is not following yet."""
+        """Restart from the vehicle's present position, because the vehicle is not following yet."""
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
@@ -197,7 +197,7 @@ LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the 
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
 CUT_SHORT: Final = 0.5  #: a hold below this fraction of its height means that another operator stopped a take-off
-CUT_SHORT_M: Final = 1.05  #: minimum shortfall for that: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
+CUT_SHORT_M: Final = 1.05  #: and the minimum shortfall: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
 STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
 
@@ -205,8 +205,8 @@ STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a cli
 class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
-    Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words, and refused steps are retried for as long as the take-off is requested. ``asked_ns`` is the time of the
+    Each step requests what is missing: the mode for arming, then arming, then the command. Refusals are reported in the
+    vehicle's own words, and refused steps are retried while the take-off is requested. ``asked_ns`` is the time of the
     last request; ``disarms`` is whether the vehicle was found armed and our unfinished landing may still disarm it.
     """
 
@@ -232,7 +232,7 @@ class TakeoffSequence:
         self._ground_m: float | None = None
         self._other_ns: int | None = None
         self._sent_ns = 0
-        self._seen = not autopilot.TAKING_OFF  # whether its take-off mode, if it has one, was seen
+        self._seen = not autopilot.TAKING_OFF  # whether the vehicle's take-off mode, if it has one, was seen
         self.refused = ""  #: why the vehicle is not armed yet
         self.arm_asked_ns: int | None = None  #: when arming was last requested; None if the vehicle was already armed
         self._arming_ns: int | None = None  # first arming request; earlier replies belong to the landing's disarming
@@ -290,7 +290,7 @@ class TakeoffSequence:
         self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
-        if not vehicle.armed and not self.started:  # our previous landing disarmed it before this flight began
+        if not vehicle.armed and not self.started:  # our previous landing disarmed the vehicle before this flight began
             self._armed_ns, self._climb_command, self._disarms = None, None, False
         elif not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
             self.given_up = "the vehicle disarmed itself"
@@ -308,7 +308,7 @@ class TakeoffSequence:
             self._best_m, self._best_ns = height, now_ns
 
     def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
-        """Return whether our previous landing can no longer disarm it, so that a later disarming has another cause."""
+        """Return whether our last landing can no longer disarm the vehicle, so a later disarming has another cause."""
         accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
         return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS
 

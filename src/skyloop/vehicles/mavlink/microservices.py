@@ -40,7 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Without a system id, it selects the first system found and keeps it from then on.
+    Without a system id, the first system found is selected and kept from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -311,8 +311,8 @@ _NAN: Final = math.nan
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     """Convert an external pose to a message.
 
-    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. Its
-    time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
+    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. The
+    message's time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)

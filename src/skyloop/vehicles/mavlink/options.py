@@ -121,7 +121,7 @@ class MavlinkOptions:
     address: Address
     system: int | None = None  #: the vehicle's system id; None for the first one found
     component: int = 1  #: the autopilot's component id, by default MAV_COMP_ID_AUTOPILOT1
-    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None for the sender of its first packet
+    peer: tuple[str, int] | None = None  #: address the vehicle sends from; None for the sender of its first packet
     own_system: int = 255
     rate_hz: float = 50.0  #: rate of attitude, position and velocity
     limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: the driver's limits by parameter name

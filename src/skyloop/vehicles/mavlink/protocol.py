@@ -127,10 +127,10 @@ class MavlinkSession(VehicleSession):
         self._known_as: Message | None = None  # version from before the link loss, kept until a new one arrives
         self._receives_us = True  # False until there is a sign that the vehicle receives our messages
         self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed and MAV_STATE when last checked
-        self._waking = False  # whether it has just booted and can't be armed yet
+        self._waking = False  # whether the vehicle has just booted and can't be armed yet
         self._prearm = ""  # the vehicle's latest reason for refusing to arm
         self._unsupported_reason = "no data from it"
-        #: Acts on whichever vehicle answers, because an emergency stop must survive the loss of the vehicle's state.
+        #: It acts on whichever vehicle answers, because an emergency stop must survive the loss of the vehicle's state.
         self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
@@ -153,7 +153,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Also raises it if the vehicle can't be flown."""
+        """Accept an action; see :meth:`SetpointController.apply`. Raises an error if the vehicle can't be flown."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found at any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -210,7 +210,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes from a peer; ``whole`` if they are one datagram. Never raises, whatever the content."""
+        """Handle bytes from a peer; ``whole`` is True if they are one datagram. Never raises, whatever the content."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
@@ -472,7 +472,7 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        """Set up a new vehicle, discarding everything known about any other."""
+        """Set up a new vehicle, discarding everything known about any other vehicle."""
         if self._kind is not None:
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             self._publish_event(event_of(text, "another", Severity.WARNING, system=heartbeat.get_srcSystem()))

@@ -109,7 +109,7 @@ class SetpointController:
     def apply(
         self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
     ) -> AnyAction:
-        """Accept an action; return the action in force, which is idle if it is ignored.
+        """Accept an action; return the action in force, which is idle if the action is ignored.
 
         While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused
         and all other actions are ignored. ``alone``: whether a failsafe requested it while no pilot was in command;
@@ -356,7 +356,7 @@ class SetpointController:
         return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and (stops or isinstance(setpoint, PositionHold)))
 
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Send an emergency stop that is due, even if nothing is being received; return whether one is in force."""
+        """Send an emergency stop if one is due, even if nothing is being received; return whether one is in force."""
         if not self.stop.active:
             return False
         shown = None

@@ -39,12 +39,12 @@ class VehicleState:
     altitude_m: float | None  #: height above the vehicle's start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: whether the vehicle reports that it receives a remote control
-    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which says whether it is armed
+    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which reports whether it is armed
     reports_landed: bool = False  #: whether the vehicle has ever reported being on the ground or in the air
 
     @property
     def airborne(self) -> bool | None:
-        """Whether it is off the ground under its own power; None if unknown.
+        """Whether the vehicle is off the ground under its own power; None if unknown.
 
         An armed vehicle may be flying if it reports neither flight nor height, for example just after being found
         again, or if it is low and its own report is late.
@@ -70,7 +70,7 @@ class Telemetry:
         self._newest: dict[str, tuple[Message, int]] = {}  # by kind, from the lowest-numbered current instance
         self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # by kind and number, where there are several
         self._ground_down: float | None = None  # how far the ground is below the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; and that place on Earth
+        self._on_earth: tuple[Vector, Message] | None = None  # position east, north, up, and the same place on Earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Store a message from the selected vehicle."""
@@ -384,7 +384,7 @@ class HealthMonitor:
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
         """Handle a ``STATUSTEXT``; return complete texts, with reasons for refusing to arm marked as such.
 
-        While the vehicle boots (``quiet``), it repeats these reasons, but each is reported only once.
+        While the vehicle boots (``quiet``), it repeats these reasons, but each reason is reported only once.
         """
         events = []
         for severity, text in self._texts.on_message(message):

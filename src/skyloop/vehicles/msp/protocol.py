@@ -450,7 +450,7 @@ class MspSession(VehicleSession):
     # Loss ----------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Start identifying it again while polling its state, so that control of a flying vehicle soon resumes.
+        """Identify the flight controller again while polling its state, so control of a flying vehicle soon resumes.
 
         After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that the vehicle's failsafe acts.
         """

@@ -32,7 +32,7 @@ NAMED_NS: Final = nanoseconds(0.4)  #: how long a reported obstacle to arming mu
 REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
 ASKED_NS: Final = nanoseconds(1.0)  #: time after which a requested take-off that has not started expires
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
-#: Temporary conditions after connecting or landing. Arming waits, with the arm switch off, until they have cleared.
+#: Temporary conditions after connecting or landing. Arming waits until they clear, with the arm switch off.
 PASSING: Final = frozenset(
     (
         "RXLOSS",
@@ -46,13 +46,13 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     )
 )
-SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until it has an attitude
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until the attitude is known
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precision
 LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off
 OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the throttle at lift-off
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: duration of a stall that counts as a touchdown
 HEADWAY: Final = 0.4  #: fraction of the requested rate below which a descent counts as stalled
-STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which it is airborne, by precision
+STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which the vehicle is airborne, by precision
 #: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
 #: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but a descent at 0.15 m/s remains visible.
 SMOOTH_S: Final = 0.4
@@ -62,7 +62,7 @@ SINK_PER_S: Final = 0.5  #: throttle reduction while the vehicle seems to be on 
 #: to be noticed even if its motion is underestimated, as in a simulated world that lags behind the firmware's clock.
 OFF_BELOW: Final = {False: 0.6, True: 0.15}
 HIGH_M: Final = 0.5
-BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown, so that it sinks
+BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown; the vehicle sinks
 BLIND_NS: Final = nanoseconds(6.0)  #: time with an unknown climb rate after which the vehicle is disarmed
 MOST_LEARNT: Final = 0.9  #: upper limit of the learnt hover throttle
 LEAST_LEARNT: Final = 0.05
@@ -212,7 +212,7 @@ class SetpointController:
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing is known to prevent it, or if it is already taking off."""
+        """Return why it can't take off now; empty if no reason is known, or if a take-off is already in progress."""
         if self.phase is not Phase.STANDING:
             return ""
         if self.stop.active:
@@ -236,7 +236,7 @@ class SetpointController:
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start a take-off, unless that is certain to fail; return why it would fail."""
+        """Let the next climb start a take-off, unless the take-off is certain to fail; return why it would fail."""
         why = self.why_not(now_ns)
         self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
         return why

@@ -45,7 +45,7 @@ class Asked:
 
 
 class Questions:
-    """Asks one question at a time, repeating each until it is answered, up to :data:`TRIES` times in total."""
+    """Asks one question at a time, and repeats it until it is answered, at most :data:`TRIES` times in total."""
 
     def __init__(self) -> None:
         self._queue: deque[tuple[Frame, Handler]] = deque()

@@ -45,7 +45,7 @@ class ReplayDriver(Driver):
         self._publisher: ReplayPublisher | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the recording's cameras. The file is read once; :meth:`open` refuses an unreadable one."""
+        """Return the recording's cameras. The file is read once; :meth:`open` refuses an unreadable file."""
         if self._capabilities is None:
             try:
                 recording, drone = self._read()

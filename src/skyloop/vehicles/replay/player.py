@@ -64,7 +64,7 @@ class Playback:
         self.duration_s = duration_s
         self.position_s = 0.0  #: position in the recording, set by the player
         self.over = False  #: whether the end has been reached, set by the player
-        self.jumps = 0  #: number of changes in position other than by playing
+        self.jumps = 0  #: number of position changes not caused by playing
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -254,7 +254,7 @@ class ReplayPublisher:
         return publish
 
     def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
-        """Publish the vehicle's part with this position, otherwise unchanged, and the proxy's as native telemetry."""
+        """Publish the vehicle's feedback with this position, and the proxy's feedback as native telemetry."""
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
         playback = self._playback

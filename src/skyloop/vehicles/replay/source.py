@@ -204,7 +204,7 @@ def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> 
 def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
     """Return the capabilities of a replay.
 
-    Its cameras are those with recorded frames. It accepts every command if the recorded vehicle accepted any,
+    Its cameras are those with recorded frames. A replay accepts every command if the recorded vehicle accepted any,
     natively or through the software autopilot.
     """
     was = drone.described

@@ -1,8 +1,8 @@
 """Conversions between the values in ROS 2 messages and Skyloop's. Pure.
 
 Both use the same axes (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical axes x
-right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's is in body
-axes; ROS 2 expresses angles as quaternions, and marks unknown values with a covariance of -1 or with NaN.
+right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's velocity is in
+body axes; ROS 2 expresses angles as quaternions, and marks unknown values with a covariance of -1 or with NaN.
 
 A ``tf2_msgs/msg/TFMessage`` is built as bytes, because its package can be installed only with a ROS 2 distribution. The
 format is OMG's Common Data Representation, version 1, little-endian, as in DDS: a four-byte header, then the fields in

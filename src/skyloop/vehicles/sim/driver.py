@@ -311,7 +311,7 @@ DOWN_M: Final = 0.08  #: height below which a descending drone counts as landed
 
 
 class SetpointController:
-    """Starts the motors for a set-point that climbs, and stops them on the ground for one that descends.
+    """Starts the motors for a climbing set-point, and stops them on the ground for a descending set-point.
 
     The simulated firmware accepts set-points only in the air, so its own take-off to the lowest height comes first.
     """

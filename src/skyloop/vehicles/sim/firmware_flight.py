@@ -178,7 +178,7 @@ class FirmwareFlight:
     # Flying ----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, *, new: bool) -> AnyAction:
-        """Pass an action to the firmware's driver; it is lost if there is no link."""
+        """Pass an action to the firmware's driver; the action is lost if there is no link."""
         inner = self._inner
         return action if inner is None else inner.apply(action, new=new)
 
@@ -192,7 +192,7 @@ class FirmwareFlight:
     # Called by the host and by the inner driver ----------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Store the truth for later feedback, and pass it to a vehicle that needs an external position."""
+        """Store the true state for later feedback, and pass it to a vehicle that needs an external position."""
         self._reports.append(report)
         inner = self._inner
         if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:

@@ -40,7 +40,7 @@ class TelloDriver(Driver):
     def capabilities(self) -> Capabilities:
         """Return the drone's capabilities.
 
-        They include the downward camera, although only SDK 3.0 can switch to it.
+        The cameras include the downward one, although only SDK 3.0 can switch to it.
         """
         return Capabilities(
             vehicle="tello",

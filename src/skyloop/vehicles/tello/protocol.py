@@ -143,8 +143,8 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 class TelloSession(VehicleSession):
     """The protocol between an open driver and its drone. Not thread-safe.
 
-    ``extra`` returns further telemetry for ``Feedback.native``, and ``video_ns`` the time when usable video or a key
-    frame last arrived (0 if never).
+    ``extra`` returns further telemetry for ``Feedback.native``. ``video_ns`` returns the time when usable video or a
+    key frame last arrived (0 if never).
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)

@@ -1,6 +1,6 @@
-"""Convert set-points to sticks and motions. The last action is kept until the state shows that it is done. Pure.
+"""Convert set-points to sticks and motions. The last action is kept until the state confirms that it is complete. Pure.
 
-Replies may arrive seconds late or never, so it repeats a take-off or landing until it takes effect.
+Replies may arrive seconds late or never, so a take-off or landing is repeated until it takes effect.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state is arriving
-        #: Set after an abandoned stop or landing until the next command: we send nothing, so it lands after 15 s.
+        #: Set after an abandoned stop or landing until the next command: we send nothing; the drone lands after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
@@ -233,7 +233,7 @@ class SetpointController:
         return True
 
     def forget_flight(self) -> None:
-        """Assume that the drone has landed: without contact or commands, it had time to land automatically."""
+        """Assume that the drone has landed: without contact or commands, it has had time to land automatically."""
         self._was_in_air = self._steering = False
 
     # Receiving ----------------------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ class SetpointController:
         return events
 
     def motions(self, now_ns: int) -> list[str]:
-        """Return the motions to send now, whose replies take seconds."""
+        """Return the motions to send now; their replies take seconds."""
         if self.stop.active:
             return [EMERGENCY] if self.stop.step(self._motors_are_off(now_ns), now_ns) else []
         if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:

@@ -141,7 +141,7 @@ class VideoStream:
 
 # Decoder -------------------------------------------------------------------------------------------------------------
 
-MOST_UNITS: Final = 120  #: maximum number kept for decoding again; the drone's key frames are 30 images apart
+MOST_UNITS: Final = 120  #: maximum number of images kept for decoding again; the drone's key frames are 30 images apart
 _PURPOSE: Final = "the video of a Tello"
 
 

@@ -3,7 +3,7 @@
 Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". The additions in SDK 3.0 (Tello Talent, and EDU with
 newer firmware) are known from the commands that djitellopy sends.
 
-A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
+A reply does not identify its command, and may arrive seconds late or twice. A reply is therefore matched to a command
 only if it has the format of that command's replies.
 
 State arrives ten times per second; unknown values are None. Axes follow aviation: x forward, y right, z down;
@@ -55,7 +55,7 @@ class Sdk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """Values of ``rc``, from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
+    """Values of ``rc``, from -100 to 100. Positive values mean right, forward, up, and clockwise seen from above."""
 
     right: int = 0
     forward: int = 0
@@ -248,7 +248,7 @@ def build(fields: list[tuple[str, str]]) -> bytes:
 
 
 PIECE: Final = 1460  #: size of every datagram of an image except the last [bytes]
-MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real images have a fiftieth of that
+MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real images are a fiftieth of that size
 _SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
@@ -275,7 +275,7 @@ def pieces(picture: bytes) -> list[bytes]:
 class Assembly:
     """Assembles images from pieces in order of arrival. Never raises, regardless of input.
 
-    ``stray`` counts bytes that don't belong to any image, ``missing`` counts images missing from the stream's numbers.
+    ``stray`` counts bytes that don't belong to any image; ``missing`` counts images missing from the stream's numbers.
     """
 
     def __init__(self) -> None:

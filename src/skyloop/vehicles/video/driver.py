@@ -133,7 +133,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams. It consists only of counters, because nothing is flying."""
+        """Publish feedback while the camera streams. Feedback consists only of counters, because nothing is flying."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))

@@ -140,7 +140,7 @@ class ContainerSource:
 def _quarter_turns(name: str) -> int:
     """Return the number of counter-clockwise quarter turns that make a file's images upright.
 
-    A phone held upright films sideways and stores a rotation matrix in the container; it is read with the images.
+    A phone held upright films sideways and stores a rotation matrix in the container, which is read with the images.
     """
     with suppress(FFmpegError, OSError, ValueError), av.open(name) as container:
         for image in itertools.islice(container.decode(container.streams.video[0]), 1):
@@ -264,7 +264,7 @@ class CameraPublisher:
         return False
 
     def publish_state(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Publish feedback if it is due; it consists only of the position in the file because nothing is flying."""
+        """Publish feedback if it is due: only the position in the file, because nothing is flying."""
         if now_ns < self._feedback_ns and not at_once:
             return
         self._feedback_ns = now_ns + FEEDBACK_NS

@@ -11,8 +11,8 @@ To use it on free local ports, as in a test::
         ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP for version 1), .control (TCP)
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` drops
-datagrams in both directions (see :mod:`skyloop.faults`).
+``firmware.stop()`` and ``firmware.start()`` restart the firmware on the same ports. ``faults=Faults(seed=1, drop=0.1)``
+drops datagrams in both directions (see :mod:`skyloop.faults`).
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class Outlet:
             self._write()
 
     def skip_to_start(self) -> None:
-        """Drop pieces until the next one with which a stream can begin."""
+        """Drop pieces until the next piece that can begin a stream."""
         self._skipping = True
 
     def close(self) -> None:
@@ -427,9 +427,9 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
         delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
-        torn_start: Whether a new video client first gets the last frame sent to another client, however old, and then
-            the frames that follow, key frames or not. A real AR.Drone 2 does this. Otherwise its stream begins with the
-            next key frame.
+        torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
+            client, however old, and then the frames that follow, key frames or not. If False, its stream begins with
+            the next key frame.
 
     Raises:
         UsageError: The version or header size is unknown, or the delay is out of range.
@@ -465,7 +465,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The actual ports, including those that the system chose for 0."""
+        """The actual ports, including those that the system chose where 0 was given."""
         return self._started.ports
 
     @property

@@ -173,7 +173,7 @@ class FlightControl:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
     def calibrate(self, device: int, now_ns: int) -> None:
-        """Handle ``CALIB``: turn once on the spot. Refused on the ground, and always by an AR.Drone 1."""
+        """Handle ``CALIB``: turn once on the spot. This is refused on the ground, and always by an AR.Drone 1."""
         if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
             return
         self.calibrations += 1

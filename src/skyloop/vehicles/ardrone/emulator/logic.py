@@ -35,7 +35,7 @@ class CommandSequence:
         self._taken_ns: int | None = None
 
     def takes(self, number: int, now_ns: int) -> bool:
-        """Return whether to execute a command with this number that was received now."""
+        """Return whether to execute a command that has this number and arrived now."""
         if self._taken_ns is not None and now_ns - self._taken_ns > nanoseconds(SILENCE_RESET_S):
             self._last = 0
         if number != RESTART and number <= self._last:

@@ -112,7 +112,7 @@ class PaveParser:
     """Splits a byte stream into frames, however the input is divided or damaged.
 
     After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame,
-    ``broken_frames`` counts truncated frames. It buffers at most one frame (``max_payload`` and a header) in addition
+    ``broken_frames`` counts truncated frames. At most one frame (``max_payload`` and a header) is buffered in addition
     to the bytes from the last call.
     """
 

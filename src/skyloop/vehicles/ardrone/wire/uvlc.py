@@ -10,7 +10,7 @@ run and level codes (see below). No recording of this video is public; the sourc
   pictures with them: the order of the coefficients, and the steps for quantiser 31; the latter also prints the first 12
   bytes of a picture.
 
-Where they disagree, this module does what is known to work with real drones:
+Where the sources disagree, this module does what is known to work with real drones:
 
 * If a macroblock's first bit is set, it is *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
 * Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if the quantiser is 31 ("the old
@@ -264,7 +264,7 @@ class BlockWalker:
     def levels(self) -> NDArray[np.float32]:
         """Return the levels of all blocks so far, in stream order; those at the position of the mean are 0.
 
-        Shape (blocks, 64). Raises DecodeError for a block with more than 64.
+        Shape (blocks, 64). Raises DecodeError for a block with more than 64 levels.
         """
         count = self._table.count[keys := self._windows[np.array(self._visits, np.int64)].astype(np.int64)]
         long_visit, long_advance, long_level = np.array(self._long, np.int64).reshape(-1, 3).T
@@ -339,7 +339,7 @@ class UvlcDecoder:
         """Return the picture in a datagram.
 
         Raises DecodeError for anything but one complete picture (truncated or damaged data, another codec
-        (:func:`is_p264`), or changes to a picture other than the previous one), and is then ready for the next.
+        (:func:`is_p264`), or changes to a picture other than the previous one). It is then ready for the next picture.
         """
         reader = _Reader(bytes(packet))
         header = reader.read_header()

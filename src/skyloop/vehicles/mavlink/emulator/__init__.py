@@ -109,7 +109,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         system: MAVLink system id, 1 to 255; None for the drone's number plus one.
         faults: Faults injected into UDP datagrams in both directions.
         delay_s: Delay added to UDP datagrams in each direction.
-        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real ones take 5 to 40).
+        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real vehicles take 5 to 40).
         gps: Whether the vehicle has GPS; without it, the autopilot is not ready until external poses arrive.
         version: 1 if it supports only MAVLink 1.
         key: 32-byte key for signing all messages; None to sign nothing.

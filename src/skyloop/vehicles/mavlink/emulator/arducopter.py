@@ -132,7 +132,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without MAVLink input, a simulated one with its throttle down applies."""
+        """Follow the remote control. Without MAVLink input, a simulated remote control with low throttle applies."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:

@@ -220,7 +220,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time. The next one waits in the kernel's backlog, connected but without data."""
+    """A TCP server for one client at a time. The next client waits in the kernel's backlog, receiving nothing."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams

@@ -69,7 +69,7 @@ class Mission:
         self._wanted = 0  # number of the item awaited in an upload; 0 if there is no upload
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the replies to a message; None if it is not about a mission."""
+        """Return the replies to a message; None if the message is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None

@@ -1,4 +1,4 @@
-"""An autopilot's state as reported by the simulation, and the MAVLink messages made from it, by number. Pure."""
+"""An autopilot's state as reported by the simulation, and the MAVLink messages made from it, keyed by number. Pure."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class AutopilotState(ABC):
 
     @property
     def boot_ms(self) -> int:
-        """Time since it was switched on, as in 32-bit message fields [ms]."""
+        """Time since power-on, as in 32-bit message fields [ms]."""
         return round(self.time_s * 1000) % _COPIES
 
     @property
@@ -189,7 +189,7 @@ def _ekf(a: AutopilotState) -> Message:
 
 
 def _estimator(a: AutopilotState) -> Message:
-    """Report the estimator's state. At rest it assumes a constant position (0x80), which still counts as known."""
+    """Report the estimator's state. At rest, it assumes a constant position (0x80), which still counts as known."""
     flags = 0x1 | 0x2 | 0x4 | 0x20 | (_PLACED if a.settled else 0x80)
     flags |= 0x80 if a.flight.standing else 0
     return m.MAVLink_estimator_status_message(a.boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)

@@ -73,11 +73,11 @@ _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITI
 
 
 class WorldAxes:
-    """Moves positions in messages between the world's axes and the autopilot's, which are parallel.
+    """Converts positions in messages between the world's axes and the autopilot's, which are parallel.
 
-    Needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while it uses
-    GPS, so each of several vehicles would have its own origin. ``begin`` is the world's origin: latitude and longitude
-    [°] and altitude [m]; None for the autopilot's own.
+    This is needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while
+    it uses GPS, so each of several vehicles would have its own origin. ``begin`` is the world's origin: latitude and
+    longitude [°] and altitude [m]; None for the autopilot's own origin.
     """
 
     def __init__(self, begin: tuple[float, float, float] | None) -> None:

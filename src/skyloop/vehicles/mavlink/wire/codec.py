@@ -186,8 +186,8 @@ class Codec:
     def decode(self, data: bytes, *, whole: bool = False, source: Hashable = None) -> list[Message]:
         """Return the messages that these bytes complete. Never raises, whatever the input.
 
-        ``whole`` means that they are one datagram from ``source``. A frame may continue in the sender's next datagram,
-        because some bridges divide a serial line's bytes anywhere.
+        ``whole`` means that the bytes are one datagram from ``source``. A frame may continue in the sender's next
+        datagram, because some bridges divide a serial line's bytes anywhere.
         """
         if not whole:
             return self._parsed(data)
@@ -258,7 +258,7 @@ _MOST_OPEN: Final = 8  #: maximum number of unfinished texts; beyond that, the o
 
 
 def chunks_of(text: str, severity: int, number: int) -> list[Message]:
-    """Split a text into messages. ``number`` is the text's id, or 0 if it fits in a single message."""
+    """Split a text into messages. ``number`` is the text's id, or 0 if the text fits in a single message."""
     data = text.encode("ascii", "replace")
     if len(data) < CHUNK:
         return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]

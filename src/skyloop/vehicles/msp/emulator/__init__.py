@@ -71,10 +71,10 @@ _ACTUAL: Final = AxisRates(7, 0, 67)
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
 #: Each mode's permanent number and name, in the order of the status bits, as in Betaflight 4.6 with default features.
 BOXES: Final = ((0, "ARM"), (1, "ANGLE"), (2, "HORIZON"), (27, "FAILSAFE"), (28, "AIR MODE"), (36, "PREARM"))
-#: Replies that consist of zeros, by number: their sizes in bytes.
+#: Replies that consist of zeros, keyed by number: their sizes in bytes.
 _ZEROS: Final = {10: 0, 38: 6, 50: 1, 52: 180, 58: 4, 70: 13, 79: 11, 82: 1, 133: 2}
-#: Replies of Betaflight 4.6.0 that don't depend on the emulator's state, by number: size in bytes, and the first bytes
-#: in hexadecimal; the rest are zeros. Recorded from its SITL at rest, with default settings.
+#: Replies of Betaflight 4.6.0 that don't depend on the emulator's state, keyed by number: size in bytes, and the first
+#: bytes in hexadecimal; the rest are zeros. They were recorded from Betaflight's SITL at rest, with default settings.
 RECORDED: Final[dict[int, tuple[int, str]]] = {
     **{number: (size, "") for number, size in _ZEROS.items()},
     5: (30, "4e6f76203236203230323631353a30343a323700484f52495a4f1f402b20"),
@@ -96,8 +96,8 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
-#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. The numbers 59,
-#: 61, 68 (which restarts the firmware) and 69 are excluded, because they get other replies or none.
+#: Write functions with numbers up to 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here.
+#: The numbers 59, 61, 68 (which restarts the firmware) and 69 are excluded, because they get other replies or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
 )
@@ -117,7 +117,7 @@ class BoardSettings:
     rx_msp: bool = True
     gps: bool = True
     barometer: bool = True
-    boot_s: float = 0.5  #: time until it can be armed [s]; 5 s on real flight controllers
+    boot_s: float = 0.5  #: time until arming is possible [s]; 5 s on real flight controllers
     flags: int = 0  #: additional flags that prevent arming, one bit each
 
 
@@ -152,7 +152,7 @@ def bit(name: str) -> int:
 class Board:
     """One flight controller. Not thread-safe: use it only on the loop's thread.
 
-    ``received`` has the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
+    ``received`` holds the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
     """
 
     def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:
@@ -160,7 +160,7 @@ class Board:
         self.armed = False
         self.received: list[int] = []
         self.frames = 0
-        self.silenced = False  #: whether it replies to nothing, as if the line were cut
+        self.silenced = False  #: whether it sends no replies, as if the line were cut
         self._flight = FlightControl(vehicle)
         self._report: Report | None = None
         self._begun_ns = now_ns

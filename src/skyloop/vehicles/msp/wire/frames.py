@@ -100,7 +100,7 @@ class Parser:
     """Finds frames in a byte stream that may contain other bytes. Never raises.
 
     After a bad checksum, the search resumes at the byte after the ``$``, so that a frame with missing bytes does not
-    also spoil the next frame. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
+    also spoil the next frame. ``skipped`` counts the bytes outside frames; ``damaged`` counts the bad checksums.
     """
 
     def __init__(self) -> None:

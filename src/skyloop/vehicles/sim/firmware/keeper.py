@@ -50,9 +50,9 @@ def become_prompt() -> None:
 
 
 def raise_priority() -> None:
-    """Prioritize all threads of this process, and those that they start, as far as permitted.
+    """Raise the priority of all threads of this process, and of the threads that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` the same number of times restores it.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as many times restores the priority.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:
@@ -81,7 +81,7 @@ def _threads() -> list[int]:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the firmware until it ends or standard input does; return the exit code."""
+    """Run the firmware until it ends or standard input is closed; return the exit code."""
     cut = arguments.index("--")
     folder, log, *settings = arguments[:cut]
     prompt = PROMPT in settings

@@ -2,8 +2,8 @@
 
 Firmware with fixed ports gets a separate network, which is possible only on Linux. A socket belongs to the network in
 which it was created, whichever process holds it. The firmware's keeper therefore leaves the computer's network before
-it starts the firmware, creates the datagram socket for the firmware there, and passes it to the parent. It relays the
-bytes of the firmware's TCP port itself, to and from an inherited listener.
+it starts the firmware, creates the datagram socket for the firmware there, and passes it to the parent. The keeper
+itself relays the bytes of the firmware's TCP port, to and from an inherited listener.
 
 ``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 if separate networks are possible.
 """

@@ -39,7 +39,7 @@ class FirmwareEventKind(StrEnum):
     ANSWERS = "answers"  #: the firmware is controlling the rotors, for the first time or again
     SILENT = "silent"  #: the firmware has not replied for a while, so the rotors stop
     DIED = "died"  #: its process ended and is being restarted
-    FAILED = "failed"  #: it could not be started; the start is retried
+    FAILED = "failed"  #: the process could not be started; the start is retried
     DEAF = "deaf"  #: the process ran but did not reply; another process is started at once
 
 
@@ -62,7 +62,7 @@ class Launch:
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
     prompt: bool = False  #: whether it needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
-    apart: Apart | None = None  #: the separate network to run in; None for the computer's
+    apart: Apart | None = None  #: the separate network to run in; None for the computer's network
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
         """Start the firmware in a folder, under a keeper."""
@@ -229,9 +229,9 @@ def _last_words(folder: Path) -> str:
 
 # Coupled to a simulation ---------------------------------------------------------------------------------------------
 
-WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, no more waits until it replies
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, there is no waiting until the firmware replies
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
-SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports it
+SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
 
 Commands = Sequence[float]
@@ -242,7 +242,7 @@ class CoupledFirmware(ABC):
 
     It is a :class:`~skyloop.sim.instruments.Firmware`: pass it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread waits up to :data:`WAIT_S` for a reply; after a time-out it does not wait again until the
-    firmware has replied. The rotors stop if it stops replying or exits; firmware that exits is restarted.
+    firmware has replied. The rotors stop if the firmware stops replying or exits; firmware that exits is restarted.
     """
 
     NAME: ClassVar[str]  #: the firmware's name in messages
@@ -272,7 +272,7 @@ class CoupledFirmware(ABC):
         self.program.start()
 
     def close(self) -> None:
-        """End the firmware. Do not call it while a simulation calls :meth:`exchange`. Idempotent."""
+        """End the firmware. Do not call this method while a simulation calls :meth:`exchange`. Idempotent."""
         self.program.close()
         self._close()
 

@@ -46,7 +46,7 @@ PROBE_EVERY: Final = 25  #: number of its steps between probes while it is silen
 LOCK_FILE = "/tmp/px4_lock"
 MAX_BACKLOG: Final = 4096  #: number of unsent bytes at which PX4 is assumed to have stopped reading
 MAX_READ: Final = 65536
-#: Parameters for this vehicle. Without a remote control, it must hold position when set-points stop.
+#: Parameters for this vehicle. Without a remote control, PX4 must hold position when set-points stop.
 PARAMETERS: Final = {
     "MPC_THR_HOVER": "0.7",
     "THR_MDL_FAC": "0.78",  # thrust is the square of rotor speed, which starts at an eighth of full speed
@@ -301,7 +301,7 @@ def _commands(controls: list[float]) -> Commands | None:
 
 
 def _runs(instance: int) -> bool:
-    """Return whether a PX4 holds this instance's lock, in which case another one would exit at once."""
+    """Return whether a PX4 process holds this instance's lock, in which case another process would exit at once."""
     if sys.platform != "linux":
         return False
     asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock for the whole file

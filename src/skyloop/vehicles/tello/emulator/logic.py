@@ -3,7 +3,7 @@
 Pure: the clock is an argument, and replies are passed to a function.
 
 Replies that are not in any guide ("error Motor stop", "error Not joystick", "error No valid marker") were reported by
-users. It has not been verified exactly when real firmware sends them.
+users. The exact conditions under which real firmware sends them are unverified.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Rising:
             self._commanded_s = now_s
             return Takeoff(), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
-            # Measured from the command, because this step may run late on a busy machine.
+            # The time is measured from the command, because this step may run late on a busy machine.
             return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
 
@@ -296,7 +296,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the reply, or None if there is none yet or none will come."""
+        """Execute a command. Return the reply; None if there is no reply yet or there will be none."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"
