@@ -296,7 +296,7 @@ class SetpointController:
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the next landing may be one that the drone starts itself
+            self._landing_is_ours = False  # the drone may start the next landing itself
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)

@@ -57,7 +57,7 @@ class Reception:
         self._watch = RestartWatch()
 
     def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
-        """Return a datagram's content; None if it is damaged or late. Never raises."""
+        """Return a datagram's content; None if the datagram is damaged or late. Never raises."""
         try:
             navdata = decode(datagram)
         except DecodeError:
@@ -164,7 +164,7 @@ class ClimbMeter:
         self._samples: deque[tuple[int, float]] = deque()
 
     def climb(self, altitude_m: float, at_ns: int) -> float | None:
-        """Add a sample and return the climb [m/s], positive up; None for the first one and after a gap."""
+        """Add a sample and return the climb [m/s], positive up; None for the first sample and after a gap."""
         samples = self._samples
         samples.append((at_ns, altitude_m))
         while len(samples) > 2 and at_ns - samples[1][0] >= CLIMB_WINDOW_NS:

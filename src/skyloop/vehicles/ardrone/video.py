@@ -229,7 +229,7 @@ def _give_up_if_silent(silent_ns: int) -> None:
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger one means a restart
+REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger step means a restart
 OLD_RUN: Final = 4  #: this many consecutive images older than the newest one also mean a restart
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
@@ -308,7 +308,7 @@ class UvlcVideo:
         return Decoded(picture.number, picture.pixels) if show else None
 
     def _is_old(self, picture: UvlcPicture) -> bool:
-        """Return whether an image repeats the newest one or is older."""
+        """Return whether an image is older than, or the same as, the newest one."""
         return self._number is not None and 0 <= (self._number - picture.number) % (1 << 32) < REORDERED
 
 

@@ -302,7 +302,7 @@ class RunningEmulator(ABC):
         self._posted = False
 
     def stop(self) -> None:
-        """Switch the firmware off. Its ports are free when this returns."""
+        """Switch the firmware off. The firmware's ports are free when this returns."""
         self._host.detach(self._drone, self)
         if self._video is not None:
             self._video.stop()
@@ -370,13 +370,13 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch the firmware on. Everything except its ports is reset."""
+        """Switch the firmware on. Everything except the ports is reset."""
         if self._running is not None:
             raise UsageError("this firmware is already running")
         self._running = self._switched_on()
 
     def stop(self) -> None:
-        """Switch the firmware off at once, even during an activity. Does nothing if it is already off.
+        """Switch the firmware off at once, even during an activity. Does nothing if the firmware is already off.
 
         The vehicle continues to follow its last command. The ports are free when this returns.
         """

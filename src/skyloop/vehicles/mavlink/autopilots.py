@@ -1,6 +1,6 @@
 """Differences between ArduCopter and PX4 in modes, commands, thrust and safety nets. Pure.
 
-``docs/mavlink.md`` says where each difference was observed.
+``docs/mavlink.md`` describes where each difference was observed.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class AutopilotProfile(ABC):
         """Return the model that turns climb rates into thrust."""
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
-        """Return a diagnostic for each safety net for which this autopilot has a parameter.
+        """Return a diagnostic for each safety net that one of this autopilot's parameters controls.
 
         By default, if this computer or its link fails, both autopilots merely stop following the last set-point.
         """

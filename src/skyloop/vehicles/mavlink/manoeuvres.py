@@ -111,7 +111,7 @@ class PositionSetpoint:
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due; it is a velocity of zero while the position or heading is unknown."""
+        """Return the set-point if one is due; the velocity is zero while the position or heading is unknown."""
         if vehicle.position is None or vehicle.yaw is None:
             self.hold_back()
             return velocity_message(Velocity(), target)
@@ -195,7 +195,7 @@ ARM_PACE_S: Final = 1.0  #: time between repeated commands to arm or take off
 ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted without a confirming heartbeat
 LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
-LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
+LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report a lift-off
 CUT_SHORT: Final = 0.5  #: a hold below this fraction of its height means that another operator stopped a take-off
 CUT_SHORT_M: Final = 1.05  #: and the minimum shortfall: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
@@ -213,7 +213,7 @@ class TakeoffSequence:
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
-        self.given_up = ""  #: why the take-off was given up; empty if it was not
+        self.given_up = ""  #: why the take-off was given up; empty if it was not given up
         self.taken_over = False  #: whether another operator chose a mode in the air
         self.declined = False  #: whether the take-off was given up because another operator chose a mode before arming
         self.rose = False  #: whether the vehicle has left the ground
@@ -235,7 +235,7 @@ class TakeoffSequence:
         self._seen = not autopilot.TAKING_OFF  # whether the vehicle's take-off mode, if it has one, was seen
         self.refused = ""  #: why the vehicle is not armed yet
         self.arm_asked_ns: int | None = None  #: when arming was last requested; None if the vehicle was already armed
-        self._arming_ns: int | None = None  # first arming request; earlier replies belong to the landing's disarming
+        self._arming_ns: int | None = None  # first arming request; earlier replies are to the landing's disarming
         self._ready = False  # was in take-off mode, armed or about to be: any other mode is another operator's choice
 
     @property

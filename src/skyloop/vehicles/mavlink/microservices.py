@@ -54,7 +54,7 @@ class VehicleSelector:
         self._received_ns = 0  # when the chosen vehicle was last heard from
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
-        """Handle a message; return events about other vehicles, or about the chosen one's move to another port."""
+        """Handle a message; return events about other vehicles, or about the chosen vehicle's move to another port."""
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
         if self.chosen == found:
             self._received_ns = now_ns

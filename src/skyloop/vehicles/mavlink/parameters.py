@@ -245,7 +245,7 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a parameter to be written; raise an error if it is unknown or read-only."""
+    """Return a parameter to be written; raise an error if the parameter is unknown or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)

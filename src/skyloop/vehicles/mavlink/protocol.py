@@ -57,7 +57,7 @@ VERSION_PACE_S: Final = 1.0  #: time between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
-_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
+_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps reveal their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that carry the mode
 
 #: Safety commands, which are sent before everything else.

@@ -32,14 +32,14 @@ class VehicleState:
     armed: bool
     status: int  #: MAV_STATE from the heartbeat
     landed: Landed
-    ready: bool | None  #: whether it can be armed; None if unknown
+    ready: bool | None  #: whether the vehicle can be armed; None if unknown
     position: Vector | None  #: position relative to its origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
     altitude_m: float | None  #: height above the vehicle's start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: whether the vehicle reports that it receives a remote control
-    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which reports whether it is armed
+    heartbeat_ns: int = 0  #: arrival time of the vehicle's newest heartbeat, which reports whether it is armed
     reports_landed: bool = False  #: whether the vehicle has ever reported being on the ground or in the air
 
     @property
@@ -115,7 +115,7 @@ class Telemetry:
     # Meaning -----------------------------------------------------------------------------------------------------
 
     def custom_mode(self) -> int | None:
-        """Return the mode number from the newest message that has one."""
+        """Return the mode number from the newest message that contains a mode."""
         heartbeat, current = self._newest.get("HEARTBEAT"), self._newest.get("CURRENT_MODE")
         if heartbeat is None:
             return None
@@ -378,7 +378,7 @@ class HealthMonitor:
 
     @property
     def was_ready(self) -> bool:
-        """Whether it has ever been ready to arm."""
+        """Whether the vehicle has ever been ready to arm."""
         return "was_ready" in self._reported
 
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:

@@ -166,7 +166,7 @@ class Setup:
     # Fitness for flight ------------------------------------------------------------------------------------------
 
     def diagnose(self, *, override: bool) -> list[Diagnostic]:
-        """Return diagnostics about what the settings mean for a flight. Severe ones prevent arming."""
+        """Return diagnostics about what the settings mean for a flight. Severe diagnostics prevent arming."""
         name = Diagnostic("firmware", True, str(self.identity))
         return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
 

@@ -147,7 +147,7 @@ class SetpointController:
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
-        """Set the flight controller's setup, and the reason why it must not be armed."""
+        """Set the flight controller's setup, and the reason why the vehicle must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
 

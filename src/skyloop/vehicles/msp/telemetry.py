@@ -75,7 +75,7 @@ class Questions:
         return self._queue[0][0]
 
     def on_frame(self, frame: Frame) -> bool:
-        """Handle a frame; return whether it is the reply to the current question."""
+        """Handle a frame; return whether the frame is the reply to the current question."""
         if not self._queue or self._sent_ns is None or frame.function != self._queue[0][0].function:
             return False
         self._answer(None if frame.direction is Direction.ERROR else frame.payload)

@@ -381,7 +381,7 @@ class Player:
         self._damaged = 0  # number of damaged frames in earlier passes
 
     def run(self, wait_for: tuple[str, ...]) -> None:
-        """Play until stopped, starting once a client wants one of these cameras, or at once if none are given.
+        """Play until stopped, starting once a client wants one of these cameras, or at once if no cameras are given.
 
         At the end the link goes down; it comes up again if a viewer seeks back.
         """

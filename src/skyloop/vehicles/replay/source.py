@@ -37,7 +37,7 @@ class Moment:
     """A drone's state at a given time in its recording, and the samples that follow."""
 
     at_ns: int
-    state: Feedback | None = None  #: state when the images were captured, or the newest one if there are no images
+    state: Feedback | None = None  #: state when the images were captured, or the newest state if there are no images
     pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
     parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before the moment

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Environment variables that configure discovery; if one of them is set, discovery is left as configured.
+#: Environment variables that configure discovery; if any of them is set, discovery is left as configured.
 DISCOVERY_VARIABLES: Final = (
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -64,7 +64,7 @@ LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 
 
 def require_rclpy(purpose: str, *packages: str) -> Any:
-    """Import rclpy and message packages; return rclpy. If one is missing, the error states the purpose."""
+    """Import rclpy and message packages; return rclpy. If a package is missing, the error states the purpose."""
     from importlib import import_module
 
     try:
@@ -78,7 +78,7 @@ def require_rclpy(purpose: str, *packages: str) -> Any:
 def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
     """Make this process's nodes visible only on this machine, unless the environment configures discovery.
 
-    Call this before creating the first node. Returns whether it changed the environment. The profile is a file in a
+    Call this before creating the first node. Returns whether the environment was changed. The profile is a file in a
     temporary directory that is removed at exit.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):

@@ -48,7 +48,7 @@ class Options:
     fps: float  #: frame rate [1/s]
     compressed: bool  #: whether images are JPEG
     stamped: bool  #: whether velocities have a stamp
-    ground: bool  #: whether it is a ground vehicle, for which take-off and landing start and end the drive
+    ground: bool  #: whether the robot is a ground vehicle, for which take-off and landing start and end the drive
     timeout_s: float  #: time without data after which the link counts as lost [s]
     domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 

@@ -83,7 +83,7 @@ class ClockMap:
 
 
 def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
-    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or is almost zero."""
+    """Return the matrix of a quaternion, shape (3, 3); None if the quaternion is not finite or is almost zero."""
     length = math.sqrt(sum(each * each for each in quaternion))
     if not (math.isfinite(length) and length > 1e-6):
         return None
@@ -98,7 +98,7 @@ def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
 
 
 def euler_of(quaternion: Quaternion) -> tuple[float, float, float] | None:
-    """Return roll, pitch and yaw of a quaternion [rad]; None if it is invalid."""
+    """Return roll, pitch and yaw of a quaternion [rad]; None if the quaternion is invalid."""
     rotation = rotation_of(quaternion)
     return None if rotation is None else euler_from_rotation(rotation)
 

@@ -40,7 +40,7 @@ class Request:
     text: str
     done: Done  #: called with the reply, or None if there was none
     tries: int = TRIES  #: maximum number of times to send it
-    sent_ns: int | None = None  #: when it was last sent
+    sent_ns: int | None = None  #: when the command was last sent
 
 
 class Conversation:
@@ -324,7 +324,7 @@ class TelloSession(VehicleSession):
         return self.setpoints.flies_unheard
 
     def _keep_alive(self, now_ns: int) -> None:
-        """Send a periodic request, which keeps the drone awake and shows whether it receives our commands."""
+        """Send a periodic request, which keeps the drone awake and reveals whether it receives our commands."""
         if self._is_silent(now_ns):
             return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:

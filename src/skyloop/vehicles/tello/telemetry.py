@@ -1,8 +1,8 @@
 """Convert state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
 
 No field in the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` increases by one every
-second only while the motors run, and the distance sensor shows whether the ground is near. Our own commands serve only
-to interpret the observations: a climb after a take-off command is a take-off.
+second only while the motors run, and the distance sensor detects whether the ground is near. Our own commands serve
+only to interpret the observations: a climb after a take-off command is a take-off.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
 def feedback_of(
     state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
 ) -> Feedback:
-    """Return the drone's state in SI units and our axes. Values that it does not report are None."""
+    """Return the drone's state in SI units and our axes. Values that the drone does not report are None."""
     acceleration = state.acceleration_mg
     factor = STANDARD_GRAVITY / 1000
     return Feedback(

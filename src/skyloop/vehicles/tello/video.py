@@ -53,7 +53,7 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras. The drone sends one camera's images at a time; the downward camera needs SDK 3.0.
+    """Return both cameras. The drone sends the images of one camera at a time; the downward camera needs SDK 3.0.
 
     Intrinsics in the address apply to the front camera.
     """

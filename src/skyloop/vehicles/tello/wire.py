@@ -49,7 +49,7 @@ class Sdk(StrEnum):
     V3_0 = "3.0"
 
     def knows(self, other: Sdk) -> bool:
-        """Return whether this version is the same as the other one or newer."""
+        """Return whether this version is the other version or a newer one."""
         return self.value >= other.value
 
 
@@ -76,7 +76,7 @@ def ports(state: int, video: int) -> str:
 
 
 def decoded(datagram: bytes) -> str | None:
-    """Return a datagram's text without surrounding white space; None if it is not text as used in this protocol."""
+    """Return a datagram's text without surrounding white space; None if it is not valid text in this protocol."""
     if len(datagram) > MAX_COMMAND:
         return None
     try:
@@ -263,7 +263,7 @@ class AccessUnit:
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
     whole: bool  #: whether the image seems to be complete
     number: int = 0  #: count of images that have arrived
-    width: int = 0  #: width according to the newest parameter set [px]; 0 before the first one
+    width: int = 0  #: width according to the newest parameter set [px]; 0 before the first parameter set
     height: int = 0
 
 

@@ -111,7 +111,7 @@ class ContainerSource:
                 coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
-            except (FFmpegError, ValueError):  # a damaged packet: the decoder continues with the next one
+            except (FFmpegError, ValueError):  # after a damaged packet, the decoder continues with the next one
                 self.damaged += 1
                 continue
             for image in images:

@@ -274,7 +274,7 @@ class CameraDevice:
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
     """Return the local cameras in order of their numbers; an empty list if the system has no Video4Linux.
 
-    Of each camera, only the first node is listed, which is the one that captures images.
+    Only the first node of each camera is listed; that node captures images.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))

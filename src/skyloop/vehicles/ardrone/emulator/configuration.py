@@ -49,7 +49,7 @@ _FACTORY: Final[dict[int, dict[str, Value]]] = {
     2: {"general:num_version_soft": "2.4.8"},
 }
 _CODECS: Final = {1: (VideoCodec.UVLC,), 2: tuple(codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P)}
-_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each channel shows one camera or a pair
+_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each channel carries one camera or a pair
 
 
 class Configuration:
@@ -167,7 +167,7 @@ class Configuration:
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 
     def _understood(self, key: Key, text: str) -> Value | None:
-        """Return the value that a text stands for; None if it is invalid."""
+        """Return the value that a text stands for; None if the text is invalid."""
         try:
             value = parse_value(text, _as_number(key.default))
         except DecodeError:

@@ -150,7 +150,7 @@ class FlightControl:
     def follow(self, progress: Progress, now_ns: int) -> None:
         """Handle ``PCMD`` or ``PCMD_MAG``.
 
-        A command with a number that is not finite is ignored. During a magnetometer calibration it is only stored.
+        A command with a number that is not finite is ignored. During a magnetometer calibration, it is only stored.
         """
         if not progress.makes_sense:
             return

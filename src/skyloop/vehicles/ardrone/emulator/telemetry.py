@@ -226,7 +226,7 @@ def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
     return lambda _: option
 
 
-#: Functions that make the options, by tag. Options without any values to report are all zero, and 27 is ``Gps``.
+#: Functions that make the options, keyed by tag. Options without any values to report are all zero, and 27 is ``Gps``.
 _MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
     **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
     **{0: _demo, 1: lambda s: o.Time(s.time), 2: _raw, 3: _physical, 5: _euler_angles},

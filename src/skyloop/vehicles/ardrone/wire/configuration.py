@@ -35,7 +35,7 @@ def format_value(value: Value) -> str:
 
 
 def parse_value(text: str, like: Value) -> Value:
-    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if it is not of that type."""
+    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if the text is not of that type."""
     text = text.strip()
     try:
         if isinstance(like, bool):

@@ -111,7 +111,7 @@ def build_header(
 class PaveParser:
     """Splits a byte stream into frames, however the input is divided or damaged.
 
-    After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame,
+    After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame;
     ``broken_frames`` counts truncated frames. At most one frame (``max_payload`` and a header) is buffered in addition
     to the bytes from the last call.
     """
@@ -170,7 +170,7 @@ class PaveParser:
         return None
 
     def _break_off(self, header: _Header) -> bool:
-        """Return whether another frame begins within this one's payload, as after a wrong length or missing bytes.
+        """Return whether another frame begins within this frame's payload, as after a wrong length or missing bytes.
 
         Without this check, one flipped bit in a length could lose all the frames within that length.
         """

@@ -151,7 +151,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PairTable:
-    """The pairs with which each window of 16 bits begins."""
+    """The pairs at the beginning of each window of 16 bits."""
 
     step: NDArray[np.int8]  #: (65536,) bits in the whole pairs; negative if the block ends with them, 0 for none
     count: NDArray[np.int64]  #: (65536,) number of pairs
@@ -351,7 +351,7 @@ class UvlcDecoder:
         return UvlcPicture(header.number, header.type, header.quant, header.width, header.height, pixels)
 
     def _before(self, header: UvlcHeader) -> Samples | None:
-        """Return the samples that a picture depends on; None if it is complete in itself."""
+        """Return the samples that a picture depends on; None if the picture is complete in itself."""
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
@@ -444,7 +444,7 @@ class _Reader:
         for k in range(count):
             try:
                 quant = self._read_macroblock(quant)
-                # Checking here is enough: the windows extend beyond the packet by more than one empty macroblock.
+                # This check is enough, because the windows extend beyond the packet by more than one empty macroblock.
                 if self._at > self._end:
                     raise DecodeError("the packet ends before it does")
             except DecodeError as error:

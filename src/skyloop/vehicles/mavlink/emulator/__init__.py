@@ -111,7 +111,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         delay_s: Delay added to UDP datagrams in each direction.
         boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real vehicles take 5 to 40).
         gps: Whether the vehicle has GPS; without it, the autopilot is not ready until external poses arrive.
-        version: 1 if it supports only MAVLink 1.
+        version: 1 if the autopilot supports only MAVLink 1.
         key: 32-byte key for signing all messages; None to sign nothing.
         video: Host and port for the front camera's video over UDP; None for no camera.
         loop: Thread shared by a fleet, to be started after all its members and stopped before any of them; None for

@@ -80,7 +80,7 @@ class Autopilot(AutopilotState):
         self._captured_ns = 0
         self._armed_s = 0.0
         self._landed_s: float | None = None
-        self._flown = False  # whether it has flown since it was armed
+        self._flown = False  # whether the vehicle has flown since it was armed
         self._gcs_s: float | None = None
         self._text = 0
         self._commands: dict[int, Handler] = {

@@ -75,7 +75,7 @@ class Target:
 
 
 def target_of(message: Message) -> Target:
-    """Return the target from ``SET_POSITION_TARGET_LOCAL_NED``, even if it is not finite."""
+    """Return the target from ``SET_POSITION_TARGET_LOCAL_NED``, even if the target is not finite."""
     mask, in_body = message.type_mask, message.coordinate_frame in (BODY, BODY_OFFSET)
     turn = flip if in_body else swap
     return Target(

@@ -127,7 +127,7 @@ class Mission:
 
 
 def answers(message: Message) -> Iterable[Message]:
-    """Yield the replies to a message; none if it is not a request handled here."""
+    """Yield the replies to a message; none if the message is not a request handled here."""
     kind = message.get_type()
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "MISSION_REQUEST_LIST":

@@ -36,7 +36,7 @@ _LANDED: Final = {
 
 
 class AutopilotState(ABC):
-    """An autopilot's state, from which messages are made. Times are on its own clock [s]."""
+    """An autopilot's state, from which messages are made. Times are on the autopilot's own clock [s]."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     REPORTS_PREARM: ClassVar[bool] = True  #: whether SYS_STATUS marks the pre-arm check as present
@@ -55,7 +55,7 @@ class AutopilotState(ABC):
 
     @property
     def time_s(self) -> float:
-        """Time since it was switched on [s]."""
+        """Time since power-on [s]."""
         return 0.0 if self._begun_s is None else self.report.believed.time_s - self._begun_s
 
     @property
@@ -65,7 +65,7 @@ class AutopilotState(ABC):
 
     @property
     def boot_ns(self) -> int:
-        """Time since it was switched on [ns]."""
+        """Time since power-on [ns]."""
         return round(self.time_s * 1e9)
 
     @property

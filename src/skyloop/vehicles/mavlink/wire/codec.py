@@ -276,7 +276,7 @@ class Texts:
     def on_message(self, message: Message) -> list[tuple[int, str]]:
         """Return the texts completed by this message, with their severities (0 emergency to 7 debug).
 
-        A chunk that arrives twice, or after the last one of its text, does not start a new text.
+        A chunk that arrives twice, or after the last chunk of its text, does not start a new text.
         """
         text = _printable(message.text)
         number = message.id

@@ -1,7 +1,7 @@
 """The firmwares' rate curves and their inverses, from rates and angles to sticks. Pure.
 
 Betaflight has five kinds of rates, plotted in its documentation. Since version 4.5, the tilt in ANGLE mode follows the
-same curve; before that, it was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
+same curve; before that, the tilt was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ class Parser:
         return found
 
     def _frame(self, at: int, found: list[Frame]) -> int:
-        """Return the length of the frame at this ``$``; 0 if it is incomplete, -1 if there is no frame."""
+        """Return the length of the frame at this ``$``; 0 if the frame is incomplete, -1 if there is no frame."""
         kept = self._kept
         left = len(kept) - at
         if left < 3:

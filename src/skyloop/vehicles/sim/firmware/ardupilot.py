@@ -61,7 +61,7 @@ class ServoPacket:
 class SimulatedState:
     """The state sent to ArduPilot. World axes are north, east, down; body axes are forward, right, down."""
 
-    time_s: float  #: time, of which only differences matter
+    time_s: float  #: time; only differences between times matter
     gyro_rad_s: Vector
     acceleration_m_s2: Vector  #: specific force, which at rest is -g along z
     position_m: Vector  #: position relative to home
@@ -187,7 +187,7 @@ class ArduCopter(CoupledFirmware):
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
         self._own_s = 0.0  # ArduCopter's own time, which pauses while it is not replying
-        self._asked = False  # whether it is waiting for a state
+        self._asked = False  # whether ArduCopter is waiting for a state
 
     @property
     def address(self) -> str:

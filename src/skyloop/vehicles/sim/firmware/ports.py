@@ -142,7 +142,7 @@ class Apart:
 class Relay:
     """The keeper's end. Create it while the process has only one thread: the process leaves the computer's network.
 
-    Raises OSError if that is not allowed.
+    Raises OSError if a new network is not allowed.
     """
 
     def __init__(self, option: str) -> None:

@@ -61,7 +61,7 @@ class Launch:
 
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
-    prompt: bool = False  #: whether it needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
+    prompt: bool = False  #: whether the firmware needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
     apart: Apart | None = None  #: the separate network to run in; None for the computer's network
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
@@ -92,7 +92,7 @@ class Program:
         there; it raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if the firmware can't be started now.
         ``report`` is called with each event, on one of this object's threads. ``verify`` is called once the process is
         running, before the start is reported; it raises ``OSError`` to have the process ended and restarted, or
-        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and removed at the end.
+        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and later removed.
         """
         self.name = name
         self.starts = 0
@@ -251,7 +251,7 @@ class CoupledFirmware(ABC):
         """Prepare to run the firmware, without starting anything.
 
         ``on_event`` is called on the simulation's or the program's thread and must return quickly. ``folder`` is where
-        the firmware keeps its settings; None for a new one that is removed at the end.
+        the firmware keeps its settings; None for a new folder that is removed at the end.
         """
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None

@@ -74,7 +74,7 @@ class Rising:
 
 
 class Landing:
-    """``land``, and the Tello's automatic landing if it receives no commands."""
+    """``land``, and the Tello's automatic landing when it receives no commands."""
 
     def step(self, report: Report) -> Step:
         if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
@@ -83,7 +83,7 @@ class Landing:
 
 
 class Flipping:
-    """``flip``; only its duration is simulated."""
+    """``flip``; only the duration is simulated."""
 
     def __init__(self, report: Report) -> None:
         self._until_s = report.truth.time_s + FLIP_S
