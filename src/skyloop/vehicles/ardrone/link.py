@@ -87,7 +87,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     def _serve_dump(self) -> None:
         with self.lock:
             self._dump.serve(self.session.configurator)
-            self.session.due_ns = 0  # so that it continues at once
+            self.session.due_ns = 0  # so that the session continues at once
 
 
 def _connected(address: str, port: int) -> socket.socket:

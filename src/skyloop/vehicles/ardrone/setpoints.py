@@ -289,7 +289,7 @@ class SetpointController:
             self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
         found = self.condition is None and gap_ns >= SILENT_NS
         if found or (self._emergency and not condition.emergency):
-            self._changed_ns, self._passed_ns = now_ns, 0  # this may be old: wait for more navdata to confirm it
+            self._changed_ns, self._passed_ns = now_ns, 0  # this state may be old: wait for more navdata to confirm it
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None

@@ -88,7 +88,7 @@ class _SafetyNet:
     name: str  #: name of the parameter
     what: str
     good: Callable[[float], bool]  #: returns whether a value is safe
-    otherwise: str  #: consequence of a value that is not safe
+    otherwise: str  #: consequence of an unsafe value
     advised: float  #: a safe value
     unit: str = ""
 

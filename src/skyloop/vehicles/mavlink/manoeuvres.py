@@ -103,7 +103,7 @@ class PositionSetpoint:
     def replace(self, action: Position) -> None:
         """Fly to another position, starting from where the vehicle is now."""
         if self.action.yaw is not None and action.yaw is None:
-            self._keep_yaw = None  # keep its present heading
+            self._keep_yaw = None  # keep the vehicle's present heading
         self.action = action
 
     def hold_back(self) -> None:
@@ -196,7 +196,7 @@ ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted w
 LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report a lift-off
-CUT_SHORT: Final = 0.5  #: a hold below this fraction of its height means that another operator stopped a take-off
+CUT_SHORT: Final = 0.5  #: a hold below this fraction of the height means that another operator stopped a take-off
 CUT_SHORT_M: Final = 1.05  #: and the minimum shortfall: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
 STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
@@ -303,7 +303,7 @@ class TakeoffSequence:
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
-            self.done = True  # its reported altitude has stopped rising
+            self.done = True  # the vehicle's reported altitude has stopped rising
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 

@@ -103,7 +103,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class CameraOptions:
-    """A camera separate from the autopilot. Its size and rate are announced before the first frame arrives."""
+    """A camera separate from the autopilot. The image size and rate are announced before the first frame arrives."""
 
     source: str = field(repr=False)  # may contain credentials
     name: str

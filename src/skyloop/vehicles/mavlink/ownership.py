@@ -26,7 +26,7 @@ class FlightOwnership:
     def __init__(self, autopilot: AutopilotProfile) -> None:
         self.left_to = ""  #: foreign mode that now flies the vehicle; empty if we fly it or there is no pilot
         self._autopilot = autopilot
-        self._by_itself = False  # its own failsafe chose the mode, so we may still hold or land the vehicle
+        self._by_itself = False  # whether its own failsafe chose the mode, in which we may still hold or land it
         self._steering = False  # whether this program started or took over the flight
         self._from = ""  # the mode at the time of the last decision; empty once one of our modes has been reported
         self._foreign_ns: int | None = None  # when the vehicle entered a mode that was not chosen here

@@ -161,7 +161,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # it has no effect, and pilots send it continuously on the ground
+            return action  # this action has no effect, and pilots send it continuously on the ground
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))

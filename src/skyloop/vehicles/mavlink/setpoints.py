@@ -228,7 +228,7 @@ class SetpointController:
             action = self._setpoint.within(action)
             self._setpoint.action = action
         if now_ns - self._sent_ns >= HURRY_NS:
-            self._sent_ns = 0  # send it at once
+            self._sent_ns = 0  # send the new set-point at once
         return action
 
     def _follow(self, setpoint: Setpoint) -> None:

@@ -33,7 +33,7 @@ class VehicleState:
     status: int  #: MAV_STATE from the heartbeat
     landed: Landed
     ready: bool | None  #: whether the vehicle can be armed; None if unknown
-    position: Vector | None  #: position relative to its origin [m]
+    position: Vector | None  #: position relative to the vehicle's origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
     altitude_m: float | None  #: height above the vehicle's start, or the closest equivalent that it reports

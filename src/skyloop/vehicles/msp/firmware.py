@@ -33,7 +33,7 @@ from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Func
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
 MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
-USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode needs
+USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode uses
 _ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
 LONG_DELAY_S: Final = 2.0  #: delay of a failsafe above which a warning is given
 CURVED_API: Final = (1, 46)  #: API version (Betaflight 4.5) from which a stick's tilt follows its rate curve

@@ -63,7 +63,7 @@ class MspSession(VehicleSession):
         self.options = options
         self.setpoints = setpoints or SetpointController(options.override)
         self.motion = MotionEstimate()
-        self.setup: Setup | None = None  #: None until it has been read
+        self.setup: Setup | None = None  #: None until the setup has been read
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: rate of acknowledged stick frames
         self.unknown = 0  #: number of frames that do not answer any request

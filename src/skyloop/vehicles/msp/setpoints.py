@@ -124,7 +124,7 @@ class SetpointController:
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
-        self._cut = False  # whether its motors were stopped without confirmation, so that it may still be flying
+        self._cut = False  # whether the motors were stopped without confirmation, so the vehicle may still be flying
         self._override = override
         self._setup = Setup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()

@@ -232,8 +232,8 @@ class ReplayPublisher:
     def still(self, moment: Moment) -> Callable[[], None]:
         """Return a function that publishes a moment's state and images with a common capture time.
 
-        It may be called repeatedly while the replay is paused; each image is decoded only once. The moment's command
-        and parameters become the current ones.
+        The function may be called repeatedly while the replay is paused; each image is decoded only once. The moment's
+        command and parameters become the current ones.
         """
         self._command = {} if moment.command is None else described(moment.command)
         for parameter in moment.parameters:

@@ -22,8 +22,8 @@ _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.s
 class Ros2Driver(Driver):
     """Any ROS 2 robot with images and ``cmd_vel``. See ``docs/ros.md`` for its options.
 
-    It supports velocities, and also take-off and landing if the address names the robot's services for them. If the
-    robot's odometry reports its height, the proxy builds the missing actions from velocities.
+    The driver supports velocities, and also take-off and landing if the address names the robot's services for them. If
+    the robot's odometry reports its height, the proxy builds the missing actions from velocities.
     """
 
     def __init__(self, uri: VehicleUri) -> None:

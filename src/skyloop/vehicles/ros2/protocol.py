@@ -181,7 +181,7 @@ class RobotSession:
             if blind:
                 self._fields = {}
             if (blind or lost) and self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
-                self._velocity = Velocity()  # its motion is unknown without odometry
+                self._velocity = Velocity()  # the robot's motion is unknown without odometry
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):

@@ -68,7 +68,7 @@ class FirmwareFlight:
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
-        self._found = False  # whether its driver has received data since the start
+        self._found = False  # whether the driver has received data since the start
         self._linked = False  # whether the firmware's driver should be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 

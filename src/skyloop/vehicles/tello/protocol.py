@@ -39,7 +39,7 @@ class Request:
 
     text: str
     done: Done  #: called with the reply, or None if there was none
-    tries: int = TRIES  #: maximum number of times to send it
+    tries: int = TRIES  #: maximum number of times to send the command
     sent_ns: int | None = None  #: when the command was last sent
 
 

@@ -243,7 +243,7 @@ class SetpointController:
         phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
-        if rose and phase is FlightState.LANDED:  # it fell over or was stopped: don't start it again
+        if rose and phase is FlightState.LANDED:  # the drone fell over or was stopped: don't start it again
             self._decide(Decision.STAY, now_ns)
             text = "the drone began to take off, and its motors stopped: it is not started again"
             self._events.append(message(text, "no_takeoff", Severity.WARNING))
@@ -303,7 +303,7 @@ class SetpointController:
     def stick(self) -> Stick | None:
         """Return the stick values for ``rc``, or None to send none.
 
-        This is the case if the drone is on the ground, taking off, landing, or flown by another program.
+        None is returned if the drone is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

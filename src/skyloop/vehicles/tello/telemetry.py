@@ -174,9 +174,9 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: estimated limit: users report that the drone refuses to start its motors somewhat above this
+HOT_C: Final = 90.0  #: estimated limit: users report that the drone does not start its motors when somewhat hotter
 COOL_C: Final = 85.0  #: temperature below which a hot drone no longer counts as hot
-PAD_LOST: Final = 5  #: number of consecutive states without a pad after which it counts as out of view
+PAD_LOST: Final = 5  #: number of consecutive states without a pad after which the pad counts as out of view
 
 
 class Health:

@@ -139,7 +139,7 @@ def answers(reply: str, command: str) -> bool:
 MAX_STATE: Final = 1024
 FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
-GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, which is its minimum
+GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, its minimum
 NO_PAD: Final = -1  #: pad number while none is in view (-2 if detection is off)
 NOWHERE_CM: Final = -100  #: value of each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
@@ -259,7 +259,7 @@ class AccessUnit:
 
     data: bytes
     is_key: bool  #: whether decoding can begin here
-    arrived_ns: int  #: when its first piece arrived
+    arrived_ns: int  #: when the image's first piece arrived
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
     whole: bool  #: whether the image seems to be complete
     number: int = 0  #: count of images that have arrived
@@ -294,7 +294,7 @@ class Assembly:
         found = []
         begins = piece.startswith(h264.START)
         if begins and self._has_picture():
-            found += self._end(whole=False)  # the last piece is missing, unless it happened to be as long as the others
+            found += self._end(whole=False)  # the last piece is missing, unless it was by chance as long as the others
         if not begins and not self._pieces:
             self.stray += len(piece)
             self._gap = True

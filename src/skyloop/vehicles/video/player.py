@@ -44,7 +44,7 @@ class DecodedImage:
     stamp_s: float
     frame: av.VideoFrame
     coded: Unit | None = None  #: the encoded image, if it is relayed unchanged
-    number: int = 0  #: its number in the stream
+    number: int = 0  #: the image's number in the stream
     reason: str = ""  #: reason for not relaying this image of a relayed stream
     turns: int = 0  #: number of counter-clockwise quarter turns that make the image upright
 

@@ -263,8 +263,8 @@ class CameraDevice:
     """A local camera."""
 
     path: Path  #: path such as ``/dev/video0``
-    name: str  #: name reported by its driver
-    allowed: bool  #: whether this user is allowed to open it
+    name: str  #: the device's name as reported by the driver
+    allowed: bool  #: whether this user is allowed to open the device
 
     def __str__(self) -> str:
         why = "" if self.allowed else ", but this user may not open it: sudo usermod -aG video $USER, and log in again"

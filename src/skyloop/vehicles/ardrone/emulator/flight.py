@@ -91,7 +91,7 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: time without commands before it hovers: general:com_watchdog in the guide (unverified)
+HOVER_AFTER_S: Final = 0.25  #: time without commands before hovering: general:com_watchdog in the guide (unverified)
 LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
 BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no longer counts as low; an estimate

@@ -26,7 +26,7 @@ FORCE: Final = 21196  #: parameter of the disarm command that means "even in fli
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
-AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until it disarms
+AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until the vehicle disarms
 _GCS: Final = 6  #: MAV_TYPE of a ground station
 #: Messages unaffected by the old request for messages.
 _ON_REQUEST: Final = (

@@ -196,7 +196,7 @@ class Codec:
             self.damaged += bool(rest)
             return self._decoded(data)
         if rest and _begins_with_a_frame(data):
-            rest = b""  # the rest of that frame never arrived
+            rest = b""  # the rest of the frame never arrived
             self.damaged += 1
         self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         found = self._parsed(rest + data)

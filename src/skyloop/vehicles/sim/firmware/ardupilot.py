@@ -276,7 +276,7 @@ class ArduCopter(CoupledFirmware):
         )
         try:
             link.sendto(encode_state(state), self._peer)
-        except OSError:  # it has just ended
+        except OSError:  # ArduPilot has just ended
             return
         self._asked, self._owed = False, True
 

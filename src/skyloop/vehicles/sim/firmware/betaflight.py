@@ -197,7 +197,7 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        if not self._has_priority:  # its simulation has to keep pace with the firmware, whose clock doesn't wait
+        if not self._has_priority:  # the simulation has to keep pace with the firmware, whose clock doesn't wait
             self._has_priority = True
             raise_priority()
         try:
@@ -325,7 +325,7 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # it is not running yet, or has exited
+        with suppress(OSError):  # the firmware is not running yet, or has exited
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:

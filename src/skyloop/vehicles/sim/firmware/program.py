@@ -35,10 +35,10 @@ _LAST_BYTES: Final = 2000
 class FirmwareEventKind(StrEnum):
     """Kinds of events that firmware causes."""
 
-    STARTED = "started"  #: its process is running
+    STARTED = "started"  #: the process is running
     ANSWERS = "answers"  #: the firmware is controlling the rotors, for the first time or again
     SILENT = "silent"  #: the firmware has not replied for a while, so the rotors stop
-    DIED = "died"  #: its process ended and is being restarted
+    DIED = "died"  #: the process ended and is being restarted
     FAILED = "failed"  #: the process could not be started; the start is retried
     DEAF = "deaf"  #: the process ran but did not reply; another process is started at once
 
@@ -267,7 +267,7 @@ class CoupledFirmware(ABC):
     def address(self) -> str: ...
 
     def start(self) -> None:
-        """Start the firmware. It may take a while to reply."""
+        """Start the firmware. The firmware may take a while to reply."""
         self._open()
         self.program.start()
 
@@ -283,7 +283,7 @@ class CoupledFirmware(ABC):
             self._starts = self.program.starts
             self._owed, self._patient, self._answered_s = False, False, None
             self._begin()
-            return STOPPED  # report this for at least one step, even if the exit was noticed late
+            return STOPPED  # report STOPPED for at least one step, even if the exit was noticed late
         commands = self._receive(WAIT_S if self._owed and self._patient else 0.0)
         if commands is not None:
             self._on_answer(readings.time_s)

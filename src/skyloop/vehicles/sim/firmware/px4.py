@@ -40,9 +40,9 @@ STATION_PORT = 18570
 MOST_INSTANCES: Final = 10  #: maximum number of instances: PX4 would use the same port for all further vehicles
 STEPS: Final = 4  #: simulation steps per step of PX4: 250 Hz, as its startup script for such simulators expects
 STEP_US: Final = 4000
-TRUTH_EVERY: Final = 5  #: number of its steps between truth messages
+TRUTH_EVERY: Final = 5  #: number of PX4 steps between truth messages
 RANGE_EVERY: Final = 10
-PROBE_EVERY: Final = 25  #: number of its steps between probes while it is silent
+PROBE_EVERY: Final = 25  #: number of PX4 steps between probes while PX4 is silent
 LOCK_FILE = "/tmp/px4_lock"
 MAX_BACKLOG: Final = 4096  #: number of unsent bytes at which PX4 is assumed to have stopped reading
 MAX_READ: Final = 65536
@@ -198,7 +198,7 @@ class Px4(CoupledFirmware):
         if self._link is None:
             return
         if self._owed and not self._patient and self._answered_s is not None and self._step % (STEPS * PROBE_EVERY):
-            return  # it hangs: data sent now would be outdated by the time it reads again
+            return  # PX4 hangs: data sent now would be outdated by the time it reads again
         messages = [*self._due(readings), self._sensor(readings, inertial)]
         self._transmit(b"".join(self._codec.encode(message) for message in messages))
         self._wanted_us = self._own_us if self._patient else 0

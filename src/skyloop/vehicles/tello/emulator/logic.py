@@ -261,7 +261,7 @@ class TelloLogic:
         self._report = report
         if truth.state is FlightState.EMERGENCY:
             self._job = None
-            self._vehicle.command(ResetEmergency())  # this takes effect on the ground: a Tello has no emergency state
+            self._vehicle.command(ResetEmergency())  # the reset works on the ground: a Tello has no emergency state
         if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:
