@@ -29,7 +29,7 @@ _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A step that writes one key; the value is text."""
+    """A step that writes one key; the value is given as text."""
 
     key: str
     text: str

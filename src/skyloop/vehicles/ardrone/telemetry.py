@@ -207,7 +207,7 @@ def _angle(millidegrees: float) -> float | None:
 
 
 def _flipped(forward_right_down: tuple[float, ...], factor: float) -> Vector | None:
-    """Convert a vector from forward, right, down to forward, left, up."""
+    """Convert a vector from forward, right, down axes to forward, left, up axes."""
     x, y, z = forward_right_down
     return _vector(x * factor, -y * factor, -z * factor)
 

@@ -288,7 +288,7 @@ class RunningEmulator(ABC):
     """Firmware that runs from its construction to :meth:`stop`, which is also called if the constructor fails halfway.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
-    read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, whose
+    only read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, whose
     creator starts it after the firmware and stops it before the firmware.
     """
 

@@ -329,7 +329,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
 
 
 def _covariance(pose: ExternalPose) -> list[float]:
-    """Return the upper right triangle for x, y, z, roll, pitch, yaw; the first number is NaN if it is unknown."""
+    """Return the upper right triangle for x, y, z, roll, pitch, yaw; NaN if the standard deviations are unknown."""
     if pose.position_std_m is None or pose.attitude_std_rad is None:
         return [_NAN] * 21
     variances = [pose.position_std_m**2] * 3 + [pose.attitude_std_rad**2] * 3

@@ -286,7 +286,7 @@ def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
 
 
 def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
-    """Return a receiver for the camera, not started yet."""
+    """Return a receiver for the camera; the receiver is not started yet."""
     settings = LiveCameraSettings(
         source(uri, options),
         options.name,

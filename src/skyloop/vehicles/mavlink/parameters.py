@@ -17,7 +17,7 @@ from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-QUIET_NS: Final = nanoseconds(0.7)  #: time without a new parameter after which missing ones are requested
+QUIET_NS: Final = nanoseconds(0.7)  #: time without a new parameter after which the missing parameters are requested
 AT_ONCE: Final = 20  #: number of missing parameters requested at once
 LIST_NS: Final = nanoseconds(3.0)  #: time between requests for the list while nothing arrives
 GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
@@ -73,7 +73,7 @@ class ParameterExchange:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter in the autopilot's unit; by the deadline, ``done`` is called with the failure or None."""
+        """Write a parameter in the autopilot's unit; call ``done`` by the deadline with the failure or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property

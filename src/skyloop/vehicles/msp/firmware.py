@@ -34,7 +34,7 @@ SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
 MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
 USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode uses
-_ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
+_ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in Betaflight and INAV
 LONG_DELAY_S: Final = 2.0  #: delay of a failsafe above which a warning is given
 CURVED_API: Final = (1, 46)  #: API version (Betaflight 4.5) from which a stick's tilt follows its rate curve
 _PROCEDURES: Final = {
@@ -47,7 +47,7 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """A flight controller's settings; None for those not reported."""
+    """A flight controller's settings; a setting that was not reported is None."""
 
     identity: Identity = field(default_factory=Identity)
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits

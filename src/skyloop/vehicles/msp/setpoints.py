@@ -46,7 +46,7 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     )
 )
-SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until the attitude is known
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: other temporary flags, reported until the attitude is known
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precision
 LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off
 OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the throttle at lift-off
@@ -147,7 +147,7 @@ class SetpointController:
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
-        """Set the flight controller's setup, and the reason why the vehicle must not be armed."""
+        """Store the flight controller's setup, and the reason why the vehicle must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
 

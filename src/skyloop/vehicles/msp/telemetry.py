@@ -263,7 +263,7 @@ class MotionEstimate:
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the ground's height while at rest; one sample's error may exceed the height of a lift-off."""
+        """Learn the ground's height while at rest; the error of a single sample may exceed the height of a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])

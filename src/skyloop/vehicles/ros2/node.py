@@ -26,7 +26,7 @@ DISCOVERY_VARIABLES: Final = (
     "ROS_LOCALHOST_ONLY",
     "ROS_DISCOVERY_SERVER",
 )
-#: Variables with a profile's path, for Fast DDS 3 and for Fast DDS 2 (Jazzy and earlier).
+#: Environment variables for the path of a profile, for Fast DDS 3 and for Fast DDS 2 (Jazzy and earlier).
 PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
 _OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
 _FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS 3

@@ -31,7 +31,7 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Full names of a robot's topics and services, empty for those that it lacks, and the other options."""
+    """Full names of a robot's topics and services (empty if the robot lacks them), and the other options."""
 
     namespace: str  #: namespace with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``

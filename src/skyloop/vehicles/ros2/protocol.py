@@ -263,7 +263,7 @@ class RobotSession:
         self._velocity, self._pending = None, pending
 
     def _fail_pending(self) -> None:
-        """Drop the pending action, and stop after a landing: without a watchdog, a robot keeps its last velocity."""
+        """Drop the pending action, and stop the robot after a landing: without a watchdog, it keeps its velocity."""
         if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
             self._velocity = Velocity()
         self._pending = None

@@ -215,7 +215,7 @@ def skew_of(info: Any) -> float:
 
 
 #: Encodings that OpenCV converts to BGR: rows per pixel of height, bytes per pixel of width, and OpenCV's name. ROS
-#: names a Bayer pattern after the first two pixels of a row, OpenCV after the second and third of the second row.
+#: names a Bayer pattern after a row's first two pixels, OpenCV after pixels 2 and 3 of the second row.
 _CONVERTED: Final[dict[str, tuple[float, int, str]]] = {
     "yuv422": (1, 2, "YUV2BGR_UYVY"),
     "uyvy": (1, 2, "YUV2BGR_UYVY"),

@@ -155,7 +155,7 @@ class SimDriver(Driver):
         return self._apply(action) if self._firmware is None else self._firmware.apply(action, new=False)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse actions that the firmware would refuse; the built-in autopilot refuses none."""
+        """Refuse actions that the firmware would refuse; the built-in autopilot refuses no actions."""
         if self._firmware is not None:
             self._firmware.driver.check(action)
 
@@ -168,7 +168,7 @@ class SimDriver(Driver):
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Pass a pose to the firmware; the built-in autopilot accepts none."""
+        """Pass a pose to the firmware; the built-in autopilot does not accept poses."""
         if self._firmware is None:
             super().external_pose(pose)
         else:

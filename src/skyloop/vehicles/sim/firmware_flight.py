@@ -100,7 +100,7 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver is opened once the process is running."""
+        """Start the firmware and let it fly the drone; the firmware's driver is opened once the process is running."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:
@@ -204,7 +204,7 @@ class FirmwareFlight:
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback with the true state at the same time, if already known."""
+        """Return the firmware's feedback, with the true state at the same time if that is known already."""
         reports = tuple(self._reports)
         if not reports:
             return feedback

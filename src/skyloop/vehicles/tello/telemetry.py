@@ -91,7 +91,7 @@ LOW_M: Final = 0.15  #: maximum height that counts as near the ground
 HIGH_M: Final = 0.25  #: minimum height that counts as off the ground
 HOVER_M: Final = 0.4  #: minimum height at the end of a take-off
 SLOW_DM_S: Final = 1.0  #: maximum vertical speed at the end of a take-off
-SETTLED: Final = 3  #: number of consecutive high and slow samples that end a take-off
+SETTLED: Final = 3  #: number of consecutive samples within both limits that end a take-off
 RISE_NS: Final = nanoseconds(8.0)  #: maximum duration of a take-off
 
 _S = FlightState
@@ -193,7 +193,7 @@ class Health:
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return a finding if the drone is too hot to fly; none while its temperature is unknown."""
+        """Return a finding if the drone is too hot to fly; no finding while its temperature is unknown."""
         if self._celsius is None:
             return []
         if not self._hot:

@@ -286,7 +286,7 @@ class Assembly:
         self._arrived_ns = 0
         self._sequence: h264.Sequence | None = None
         self._before: h264.Slice | None = None
-        self._gap = True  # whether there was a gap since the last returned image
+        self._gap = True  # whether there was a gap after the last returned image
         self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:

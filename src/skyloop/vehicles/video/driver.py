@@ -179,14 +179,14 @@ _AUTO: Final = "auto"
 
 @dataclass(frozen=True, slots=True)
 class DeviceOptions:
-    """Settings for a local camera; those not given are left unchanged."""
+    """Settings for a local camera; settings that are not given are left unchanged."""
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
     gain: int | str = ""  #: gain in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
-        """Set exposure and gain; return a readable text for each failure."""
+        """Set exposure and gain; return a readable description of each failure."""
         if self.exposure == "" and self.gain == "":
             return []
         try:

@@ -195,7 +195,7 @@ Source = ContainerSource | PaveSource
 FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
 POLL_S: Final = 0.02  #: time between checks for a viewer
 BEHIND_NS: Final = 250_000_000  #: lag beyond which the schedule restarts instead of rushing to catch up
-GAP_S: Final = 2.0  #: maximum step between stamps; a longer one, or a step back, is a cut in the recording
+GAP_S: Final = 2.0  #: maximum step between stamps; a longer step, or a step back, is a cut in the recording
 
 
 class FilePacer:

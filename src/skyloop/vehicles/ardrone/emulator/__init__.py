@@ -57,7 +57,7 @@ REPORTS_HZ: Final = 125.0  #: report rate that a world can sustain in real time
 
 
 def with_ardrones(options: SimOptions | None = None) -> SimOptions:
-    """Return the options for a world of AR.Drones: their identified response, and the highest navdata rate.
+    """Return the options for a world of AR.Drones, with their identified response and the highest navdata rate.
 
     The firmware has its own cameras and ignores those in the options.
     """
@@ -90,7 +90,7 @@ class Listeners:
     """
 
     def __init__(self) -> None:
-        self._sequences: dict[Address, int] = {}  # ordered by the time of the last request
+        self._sequences: dict[Address, int] = {}  # ordered by the time of each recipient's last request
 
     def refresh(self, address: Address) -> bool:
         """Record a request from an address; return whether the address is new."""

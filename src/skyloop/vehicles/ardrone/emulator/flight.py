@@ -73,7 +73,7 @@ def set_point(
     most_tilt = configuration.number("control:euler_angle_max")
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        # The command is relative to the remote control's heading: rotate it by the difference from the drone's.
+        # The command is relative to the remote control's heading: rotate it by the difference to the drone's heading.
         right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")

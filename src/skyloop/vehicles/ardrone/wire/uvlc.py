@@ -290,7 +290,7 @@ class BlockWalker:
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 MAX_PACKET: Final = 65_535  #: maximum size of a picture, which is one datagram [bytes]
-_MAX_TAIL_BITS: Final = 64  # number of zero bits after the end of the picture that are too many for padding
+_MAX_TAIL_BITS: Final = 64  # more zero bits than this after the end of the picture are too many for padding
 # Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
 # also be rounded up by half a step.
 _MAX_DC: Final = 2048

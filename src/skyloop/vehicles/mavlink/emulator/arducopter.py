@@ -262,7 +262,7 @@ class ArduCopter(Autopilot):
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target with a position relative to the vehicle, as in all frames but one."""
+        """Return a target whose position is relative to the vehicle; this is the case in all frames but one."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target

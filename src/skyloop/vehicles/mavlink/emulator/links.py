@@ -46,7 +46,7 @@ class Ports:
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
         """Return ports numbered from a base, which increases by 10 per drone: UDP port, remote UDP port, TCP port.
 
-        The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` for ports above 65535.
+        The base is None for the standard ports, 0 for any free ports. Raises :class:`UsageError` for ports above 65535.
         """
         if base is None:
             return cls.standard(kind, drone)

@@ -85,7 +85,7 @@ class Px4(Autopilot):
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
         self._lost_gcs = False
-        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up and left turn, each 1 at full stick
+        self._stick = (0.0, 0.0, 0.0, 0.0)  # stick positions forward, left, up and left turn, each 1 at full stick
         self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # filtered speed of each stick [1/s]
         self._stick_s = -math.inf
         self._lost_stick_s: float | None = None  # when the remote control in use was lost

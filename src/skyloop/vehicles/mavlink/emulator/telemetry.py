@@ -77,7 +77,7 @@ class AutopilotState(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether its estimator reports a good position, which is the last step of booting."""
+        """Whether the autopilot's estimator reports a good position, which is the last step of booting."""
         return self.time_s >= self._boot_s and self.has_origin
 
     @property

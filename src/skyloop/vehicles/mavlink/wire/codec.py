@@ -63,7 +63,7 @@ class _Kind(NamedTuple):
 
 @lru_cache(maxsize=512)  # bounded, because anybody can send invalid message numbers
 def _kind_of(number: int) -> _Kind | None:
-    """Return how to create messages of a type; None if the type is unknown or has strings or arrays."""
+    """Return how to create messages of a type; None if the type is unknown or contains strings or arrays."""
     made: Any = dialect.mavlink_map.get(number)
     if made is None or any(made.array_lengths) or set(made.lengths) != {1}:
         return None

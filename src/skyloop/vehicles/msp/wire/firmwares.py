@@ -131,7 +131,7 @@ def stick_for(curve: Curve, wanted: float) -> float:
     return -stick if wanted < 0 else stick
 
 
-#: Flags since Betaflight 4.1 (API 1.42), from bit 0; ARM_SWITCH is always a version's last flag.
+#: Flags since Betaflight 4.1 (API 1.42), from bit 0; ARM_SWITCH is the last flag in every version.
 BETAFLIGHT_FLAGS: Final = (
     *("NOGYRO", "FAILSAFE", "RXLOSS", "NOT_DISARMED", "BOXFAILSAFE", "RUNAWAY", "CRASH", "THROTTLE", "ANGLE"),
     *("BOOTGRACE", "NOPREARM", "LOAD", "CALIB", "CLI", "CMS", "BST", "MSP", "PARALYZE", "GPS", "RESCUE_SW"),

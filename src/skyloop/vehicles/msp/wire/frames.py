@@ -60,7 +60,7 @@ def crc8(data: bytes) -> int:
 
 
 def xor(data: bytes) -> int:
-    """Return the exclusive or of all bytes, which is version 1's checksum."""
+    """Return the exclusive OR of all bytes, which is version 1's checksum."""
     made = 0
     for byte in data:
         made ^= byte

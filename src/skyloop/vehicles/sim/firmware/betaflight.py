@@ -254,7 +254,7 @@ class Betaflight(CoupledFirmware):
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Check that Betaflight replies on its serial port and that its flight control has run."""
+        """Check that Betaflight replies on its serial port and that the flight control loop has run."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
             try:
                 _wait_for_flight_control(link)

@@ -21,7 +21,7 @@ from typing import Final
 from skyloop.child_process import on_parent_end
 from skyloop.vehicles.sim.firmware import ports
 
-LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which is ahead of all ordinary processes
+LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which runs ahead of all ordinary processes
 NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
 SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
@@ -52,7 +52,7 @@ def become_prompt() -> None:
 def raise_priority() -> None:
     """Raise the priority of all threads of this process, and of the threads that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as many times restores the priority.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` equally often restores it.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:

@@ -73,7 +73,7 @@ class Launch:
 class Program:
     """A firmware process that is restarted whenever it ends, until :meth:`close`.
 
-    ``starts`` counts the starts; ``pid`` is the process id, 0 while it is not running.
+    ``starts`` counts the starts; ``pid`` is the process id, or 0 while the process is not running.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """PX4 in the simulated world, connected through MAVLink's hardware-in-the-loop messages and running in step with it.
 
-PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is its clock: PX4
+PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is PX4's clock: PX4
 replies to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """

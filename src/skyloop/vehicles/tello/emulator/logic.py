@@ -40,7 +40,7 @@ OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
 RISES_WITHIN_S: Final = 0.5  #: simulated time without rising after which take-off was refused for a low battery
 TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, but the drone hovered long before it
-FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
+FLIP_S: Final = 1.5  #: duration of a flip (an estimate); the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
 PATIENCE_S: Final = 30.0  #: time after which an unfinished command fails
 _NEAR_M: Final = 0.06  # maximum distance at which a move ends …
@@ -153,7 +153,7 @@ MOVES: Final = {
     "forward": (1, 0, 0),
     "back": (-1, 0, 0),
 }  #: forward, left, up
-#: First SDK with each command, and the ranges of its integers.
+#: The first SDK version that has each command, and the ranges of the command's integers.
 NUMBERS: Final[dict[str, tuple[Sdk, tuple[Range, ...]]]] = {
     **dict.fromkeys(MOVES, (Sdk.V1_3, _MOVE)),
     "cw": (Sdk.V1_3, ((1, 3600),)),
@@ -296,7 +296,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the reply; None if there is no reply yet or there will be none."""
+        """Execute a command. Return the reply; None if there is no reply, or not yet."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"
