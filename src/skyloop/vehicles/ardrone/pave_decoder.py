@@ -31,7 +31,7 @@ class PaveDecoder:
     After damage or a gap in the frame numbers, it returns nothing until the next key frame, because the images would be
     smeared. ``waited`` counts the frames dropped for these reasons; ``damaged`` counts undecodable frames.
 
-    PaVE and H.264 have no checksum, so a flipped bit that leaves the stream valid goes unnoticed. TCP has one.
+    PaVE and H.264 have no checksum, so a flipped bit goes unnoticed if the stream remains valid. TCP has one.
     """
 
     def __init__(self) -> None:

@@ -58,7 +58,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the current limits according to the drone's configuration; None if any is missing or not positive."""
+    """Return the current limits according to the drone's configuration; None if a limit is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):

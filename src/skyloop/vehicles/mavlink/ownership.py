@@ -21,7 +21,7 @@ _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
-    """Decides who is flying, based on the modes that the vehicle reports and those requested here."""
+    """Decides who is flying, based on the modes that the vehicle reports and the modes requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
         self.left_to = ""  #: foreign mode that now flies the vehicle; empty if we fly it or there is no pilot

@@ -153,7 +153,7 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the written value, compared in single precision unless ``exact``."""
+    """Return whether the vehicle reports the written value, comparing in single precision unless ``exact`` is True."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 

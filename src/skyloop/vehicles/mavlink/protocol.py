@@ -172,7 +172,7 @@ class MavlinkSession(VehicleSession):
         return applied
 
     def pose_problem(self, captured_ns: int, now_ns: int) -> str:
-        """Return why an external pose can't be sent now; empty if it can.
+        """Return why an external pose can't be sent now; empty if the pose can be sent.
 
         While the vehicle is silent, a pose might wait in a buffer. Once the vehicle resumes reading, an autopilot that
         timestamps poses on arrival would mistake the delayed pose for a new one.

@@ -24,7 +24,7 @@ _CLOSE_S: Final = 2.0  #: time allowed for the thread to end
 
 
 class ReplayDriver(Driver):
-    """A vehicle that replays a recording: it accepts every command but follows none.
+    """A vehicle that replays a recording: it accepts every command but follows no command.
 
     With ``speed=max`` nothing plays automatically. The consumer sets :attr:`clock` before :meth:`open`, then advances
     the replay through :attr:`steps`.

@@ -53,7 +53,7 @@ class Options:
     domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
-        """Return the capabilities that follow from the robot's topics and services."""
+        """Return the capabilities provided by the robot's topics and services."""
         actions: set[str] = set()
         if self.cmd_vel:
             actions = {"idle", "velocity"}

@@ -60,8 +60,8 @@ def nanoseconds_of(stamp: Any) -> int:
 class ClockMap:
     """Converts times on a proxy's monotonic clock to ROS time.
 
-    The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that the intervals between
-    stamps equal those between captures. A larger error means that a clock was set, or that ROS time is simulated.
+    The offset between the clocks is kept until its error exceeds ``tolerance_s``, so that the intervals between stamps
+    equal the intervals between captures. A larger error means that a clock was set, or that ROS time is simulated.
     """
 
     def __init__(self, tolerance_s: float = 1e-3) -> None:

@@ -65,7 +65,7 @@ class FrameSize:
 
     width: int  #: width [px]; for a range, the largest
     height: int
-    fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, its two ends
+    fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, the two ends
     smallest: tuple[int, int] | None = None  #: the smallest size in a range
 
     def __str__(self) -> str:
@@ -155,7 +155,7 @@ class V4l2Device:
         lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
         if not lowest <= exposure_ms <= highest:
             return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
-        self._set(AUTO_EXPOSURE, _MANUAL)  # fails, harmlessly, on a device without automatic exposure
+        self._set(AUTO_EXPOSURE, _MANUAL)  # fails on a device without automatic exposure, which is harmless
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:

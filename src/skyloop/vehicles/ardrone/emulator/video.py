@@ -240,7 +240,7 @@ def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> 
 
 
 def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
-    """Return the zeros that pad to the next multiple of ``size`` bits."""
+    """Return the zero bits needed to reach the next multiple of ``size`` bits."""
     return np.zeros(-sum(map(len, bits)) % size, np.uint8)
 
 

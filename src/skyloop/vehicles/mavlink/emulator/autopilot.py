@@ -152,7 +152,7 @@ class Autopilot(AutopilotState):
                 port.send(parameter)
 
     def send_text(self, text: str, severity: int = WARNING) -> None:
-        """Send a text message on all links, in chunks if it is long."""
+        """Send a text message on all links, in chunks if the message is long."""
         self._text = self._text % 0xFFFF + 1
         for port in self.ports:
             for chunk in chunks_of(text, severity, self._text):

@@ -75,7 +75,7 @@ LIMITS: Final = Limits(
     climb_m_s=FULL_CLIMB_M_S,
     yaw_rate_rad_s=FULL_YAW_RATE_RAD_S,
     altitude_m=10.0,
-    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # the speed with a stick in a corner
+    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # speed with the stick in a corner
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
