@@ -22,14 +22,14 @@ from skyloop.vehicles.ardrone.wire.navdata import State
 
 REPEAT_NS: Final = nanoseconds(0.15)  #: time between repeats of an unacknowledged CONFIG: two periods of demo mode
 REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: time between repeats of a request for the dump
-MAX_DUMP: Final = 1 << 18  #: maximum accepted size of a dump in bytes; real ones have about 5000
+MAX_DUMP: Final = 1 << 18  #: maximum accepted size of a dump in bytes; real dumps have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
 _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A step that writes one key; the value is text."""
+    """A step that writes one key; the value is given as text."""
 
     key: str
     text: str
@@ -220,7 +220,7 @@ class Configurator:
         self._end_step()
         self._exchange = None
         exchange.done(failure)
-        if self._exchange is None:  # unless the callback submitted another one
+        if self._exchange is None:  # unless the callback submitted another exchange
             self._next_exchange()
 
 

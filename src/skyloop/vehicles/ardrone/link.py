@@ -87,7 +87,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     def _serve_dump(self) -> None:
         with self.lock:
             self._dump.serve(self.session.configurator)
-            self.session.due_ns = 0  # so that it continues at once
+            self.session.due_ns = 0  # so that the session continues at once
 
 
 def _connected(address: str, port: int) -> socket.socket:
@@ -102,7 +102,7 @@ def _connected(address: str, port: int) -> socket.socket:
 
 
 def _discard(port: socket.socket) -> None:
-    """Discard what the AT port received: only errors from the host, which the navdata socket reports too."""
+    """Discard data received on the AT port: only errors from the host, which the navdata socket also reports."""
     with suppress(OSError):
         while port.recv(MAX_DATAGRAM):
             pass

@@ -90,7 +90,7 @@ class Entry:
     key: str
     like: bool | int | float | str | tuple[float, ...]  #: any value of the key's type
     divisor: float = 1.0
-    names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if it has no named values
+    names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if the values have no names
 
     def to_text(self, value: Value) -> str:
         """Convert a value to the drone's notation; raise :class:`ParameterError` if its type or name does not fit."""
@@ -108,7 +108,7 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """Convert the drone's text to a value; raise :class:`DecodeError` if it does not fit the key's type."""
+        """Convert the drone's text to a value; raise :class:`DecodeError` if the text does not fit the key's type."""
         value = parse_value(text, self.like)
         if self.names:
             number = int(str(value))
@@ -205,7 +205,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
 
 
 def _choices(name: str, version: int | None) -> tuple[int, ...]:
-    """Return the allowed values of a key for which they depend on the drone's version."""
+    """Return a key's allowed values if they depend on the drone's version."""
     if name == CHANNEL_KEY:
         return tuple(range(len(_CHANNELS[version or 2])))
     if name == "video:video_codec":
@@ -258,7 +258,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen the range to include the current value, which shows that this drone allows more than is documented."""
+    """Widen the range to include the current value, which proves that this drone allows more than is documented."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))
@@ -272,7 +272,7 @@ def _widened(parameter: Parameter) -> Parameter:
 
 # Commands that are not actions ---------------------------------------------------------------------------------------
 
-#: Sends a command in each of a number of ticks.
+#: Sends a command in each of a given number of ticks.
 Send = Callable[[AtMessage, int], None]
 
 _REPEATS: Final = 3
@@ -281,7 +281,7 @@ _HALF_TURN: Final = 3.1416  #: π rounded up [rad], so that π itself is within 
 
 
 def _switch(name: str, description: str, *, momentary: bool) -> Parameter:
-    """Return a switch, which triggers an action each time it is written if it is ``momentary``."""
+    """Return a switch, which triggers an action each time it is written if ``momentary`` is True."""
     return Parameter(name, ParameterType.BOOL, False, default=False, description=description, momentary=momentary)
 
 

@@ -28,10 +28,10 @@ class PaveDecoder:
     """Decodes the frames of a PaVE stream: one frame in, at most one image out, without delay.
 
     Returns nothing until the first key frame, because the stream may be torn and the drone sends a stale frame first.
-    After damage or a gap in the frame numbers it returns nothing until the next key frame, because the images would be
-    smeared. ``waited`` counts the frames dropped for these reasons, ``damaged`` those that could not be decoded.
+    After damage or a gap in the frame numbers, it returns nothing until the next key frame, because the images would be
+    smeared. ``waited`` counts the frames dropped for these reasons; ``damaged`` counts undecodable frames.
 
-    PaVE and H.264 have no checksum, so a flipped bit that leaves the stream valid goes unnoticed. TCP has one.
+    PaVE and H.264 have no checksum, so a flipped bit goes unnoticed if the stream remains valid. TCP has one.
     """
 
     def __init__(self) -> None:

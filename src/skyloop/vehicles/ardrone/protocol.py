@@ -30,7 +30,7 @@ FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes one only if its number exceeds the last; a 1 restarts the count."""
+    """Numbers the commands. A command is executed only if its number exceeds the last one; 1 restarts the count."""
 
     def __init__(self) -> None:
         self._sequence = 0
@@ -169,9 +169,9 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even in a gap too short to count as a lost link.
+        """Detect that the drone restarted or lost contact with us, even if the gap was too short to be a lost link.
 
-        The drone may have lost its set-up in the process. Two consecutive datagrams must show the change.
+        The drone may have lost its set-up in the process. Two consecutive datagrams must report the change.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state
@@ -236,7 +236,7 @@ class ArdroneSession(VehicleSession):
     def _check_deafness(self, now_ns: int) -> None:
         """Restart the sequence if the watchdog bit stays set.
 
-        The drone clears the bit when it accepts commands. If the bit stays set, its count may be ahead of ours.
+        The drone clears the bit when it accepts commands. If the bit stays set, the drone's count may be ahead of ours.
         """
         if self._deaf_since_ns is None:
             self._deaf_since_ns = now_ns
@@ -266,7 +266,7 @@ class ArdroneSession(VehicleSession):
     def _submit_setup(self, now_ns: int) -> None:
         failed = self._setups_failed
         options = replace(self.options, ids=False) if failed > 1 else self.options
-        # A drone that kept our ids ignores commands without them; one that lost them ignores commands with them.
+        # A drone that kept our ids ignores commands without them; a drone that lost our ids ignores commands with them.
         self.configurator.ids = self._ids if failed % 2 else None
         setup = Setup(options, self.configurator, self._ids, self.remembered)
         done = partial(self._setup_done, setup)

@@ -1,9 +1,9 @@
 """Convert set-points to ``REF`` and ``PCMD``, tick by tick. Pure.
 
-``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
-emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps it
-set until navdata shows the change. It is toggled again only if navdata made later by the drone still shows no effect,
-because one toggle too many would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
+``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata reports the new state. The
+emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps
+the bit set until navdata confirms the change. The bit is toggled again only if later navdata still shows no effect,
+because an extra toggle would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
 climb (positive up) and yaw rate (positive clockwise), each from -1 to 1 as a fraction of the limit set in the drone.
 """
 
@@ -49,7 +49,7 @@ class StickLimits:
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """The four values of ``PCMD``, each from -1 to 1, with the signs used there."""
+    """The four values of ``PCMD``, each from -1 to 1, with that command's signs."""
 
     roll: float
     pitch: float
@@ -58,7 +58,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the current limits according to the drone's configuration; None if any is missing or not positive."""
+    """Return the current limits according to the drone's configuration; None if a limit is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):
@@ -88,8 +88,8 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
 def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
     """Return ``PCMD`` for these stick values; None means hover.
 
-    With a reference, return ``PCMD_MAG``, for which forward and right are relative to that heading (0 magnetic north,
-    positive counter-clockwise) instead of the drone's nose.
+    With a reference, return ``PCMD_MAG``, in which forward and right are relative to that heading (0 magnetic north,
+    positive counter-clockwise) rather than to the drone's nose.
     """
     if stick is None:
         return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))
@@ -105,8 +105,8 @@ def _share(value: float, limit: float) -> float:
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still on the ground is refusing to take off
-RISES_NS: Final = nanoseconds(3.0)  #: time after sending a take-off within which a rise is ours, not another program's
-#: Navdata shows the effect of the emergency bit within this time, whether by the drone's clock or by ours.
+RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after sending a take-off is ours, not another program's
+#: Navdata reports the effect of the emergency bit within this time, measured by the drone's clock or by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
@@ -161,7 +161,7 @@ class SetpointController:
 
     def __init__(self) -> None:
         self.condition: Condition | None = None  #: according to the newest navdata; None while the drone is silent
-        self.limits: StickLimits | None = None  #: None until they have been read
+        self.limits: StickLimits | None = None  #: None until the limits have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
         self._decision = Decision.STAY
@@ -169,8 +169,8 @@ class SetpointController:
         self._landing_is_ours = False
         self._decided_ns = 0
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
-        self._releasing = False  # whether a reset was requested that does not show in navdata yet
-        self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
+        self._releasing = False  # whether a requested reset is not visible in navdata yet
+        self._emergency = False  # whether the newest navdata reports an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
         self._bit_due = False  # whether to set the bit next, regardless of navdata
         self._changed_ns = 0  # when the bit last changed or was requested, or an emergency ended
@@ -276,8 +276,8 @@ class SetpointController:
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
-        ``passed_ns`` is the drone's own time since the previous navdata; None if it equals the time that passed here.
-        This tells delayed navdata, which arrives in a burst, from new navdata.
+        ``passed_ns`` is the drone's own time since the previous navdata; None if it equals the time that passed on this
+        host. This distinguishes delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
@@ -289,14 +289,14 @@ class SetpointController:
             self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
         found = self.condition is None and gap_ns >= SILENT_NS
         if found or (self._emergency and not condition.emergency):
-            self._changed_ns, self._passed_ns = now_ns, 0  # this may be old: wait for more navdata to confirm it
+            self._changed_ns, self._passed_ns = now_ns, 0  # this state may be old: wait for more navdata to confirm it
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the next landing may be one that the drone starts itself
+            self._landing_is_ours = False  # the drone may start the next landing itself
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)
@@ -338,7 +338,7 @@ class SetpointController:
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
     def _ask_bit(self, now_ns: int) -> None:
-        self._bit_due = not self._bit  # if it is already set, wait for its effect
+        self._bit_due = not self._bit  # if the bit is already set, wait for its effect
         self._on_bit(now_ns)
 
     def _on_bit(self, now_ns: int) -> None:
@@ -354,7 +354,7 @@ class SetpointController:
         if not wanted:
             self._bit = self._bit_due = False
         elif before and without_effect:
-            self._bit, self._bit_due = False, True  # clear it for one tick to create another edge
+            self._bit, self._bit_due = False, True  # clear it for one tick, so that setting it creates another edge
         elif self._bit_due or without_effect:
             self._bit, self._bit_due = True, False
         if self._bit is not before:
@@ -376,7 +376,7 @@ class SetpointController:
         if self.condition is None:
             return None  # leave the drone as it is
         if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
-            return None  # it may have landed and would take off again
+            return None  # the drone may have landed and would take off again
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         lands = by_itself or (self._landing_is_ours and self.condition.touches_down)
         return Ref.TAKEOFF if self.condition.flying and not lands else Ref(0)

@@ -35,7 +35,7 @@ from skyloop.vehicles.ardrone.wire.navdata import (
 
 # Reception -----------------------------------------------------------------------------------------------------------
 
-#: Period of the drone's datagrams in demo mode (True, as before its set-up) and with all options (False).
+#: Period of the drone's datagrams: in demo mode, as before its set-up (True), and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: gap after which a lower number means a restart, not a late datagram
 _MICROSECOND_BITS: Final = 21
@@ -57,7 +57,7 @@ class Reception:
         self._watch = RestartWatch()
 
     def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
-        """Return a datagram's content; None if it is damaged or late. Never raises."""
+        """Return a datagram's content; None if the datagram is damaged or late. Never raises."""
         try:
             navdata = decode(datagram)
         except DecodeError:
@@ -74,7 +74,7 @@ class Reception:
         return navdata
 
     def expect_restart(self) -> None:
-        """Accept any sequence number next, because the drone was silent or lost us."""
+        """Accept any sequence number next, because the drone was silent or lost contact with us."""
         self._accepted_ns = 0
 
     def telemetry(self) -> dict[str, Value]:
@@ -99,8 +99,8 @@ class Reception:
 class DroneClock:
     """Determines the capture time of a datagram's state on this host's clock.
 
-    Without the option ``time``, this is when the datagram arrived; with it, the drone's stamps corrected by the
-    smallest recent delay. Times never go backwards.
+    Without the option ``time``, this is the datagram's arrival time; with it, this is the drone's stamp corrected by
+    the smallest recent delay. Times never go backwards.
     """
 
     def __init__(self) -> None:
@@ -164,7 +164,7 @@ class ClimbMeter:
         self._samples: deque[tuple[int, float]] = deque()
 
     def climb(self, altitude_m: float, at_ns: int) -> float | None:
-        """Add a sample and return the climb [m/s], positive up; None for the first one and after a gap."""
+        """Add a sample and return the climb [m/s], positive up; None for the first sample and after a gap."""
         samples = self._samples
         samples.append((at_ns, altitude_m))
         while len(samples) > 2 and at_ns - samples[1][0] >= CLIMB_WINDOW_NS:
@@ -207,7 +207,7 @@ def _angle(millidegrees: float) -> float | None:
 
 
 def _flipped(forward_right_down: tuple[float, ...], factor: float) -> Vector | None:
-    """Convert a vector from forward, right, down to forward, left, up."""
+    """Convert a vector from forward, right, down axes to forward, left, up axes."""
     x, y, z = forward_right_down
     return _vector(x * factor, -y * factor, -z * factor)
 

@@ -2,9 +2,9 @@
 
 An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
 requesting them. The stamps in PaVE headers are the drone's own time in 32-bit milliseconds (``video_encapsulation.h``
-in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. The intrinsics
-for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch) for 640×360 images; other
-drones differ by a few per cent. None are known for the AR.Drone 1.
+in the AR.Drone SDK 2.0.1). No source specifies which moment the stamps refer to; the driver assumes the time of
+capture. The intrinsics for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch)
+for 640×360 images; other drones differ by a few per cent. No intrinsics are known for the AR.Drone 1.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras; the drone sends one at a time. Intrinsics in the address apply to the front one."""
+    """Return both cameras; the drone sends one at a time. Intrinsics in the address apply to the front camera."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -89,8 +89,8 @@ class DroneStamps:
 class PaveAssembly:
     """Assembles the frames of one connection.
 
-    The first frame may be seconds old (seen in a capture from a real drone). It is therefore held back until the second
-    one arrives, and returned only if their numbers are consecutive.
+    The first frame may be seconds old (seen in a capture from a real drone). The first frame is therefore held back
+    until the second one arrives, and is returned only if their numbers are consecutive.
     """
 
     def __init__(self, connection: int) -> None:
@@ -98,7 +98,7 @@ class PaveAssembly:
         self._parser = PaveParser()
         self._stamps = DroneStamps()
         self._stale = 0
-        self._first: tuple[int, Coded] | None = None  # the first frame with its number, until the second one arrives
+        self._first: tuple[int, Coded] | None = None  # the first frame with its number, until the second frame arrives
         self._greeted = False
 
     @property
@@ -229,8 +229,8 @@ def _give_up_if_silent(silent_ns: int) -> None:
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger one means a restart
-OLD_RUN: Final = 4  #: number of consecutive images older than the newest that also means a restart
+REORDERED: Final = 64  #: maximum step back in the numbers of late images; a larger step means a restart
+OLD_RUN: Final = 4  #: this many consecutive images older than the newest one also mean a restart
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
@@ -308,7 +308,7 @@ class UvlcVideo:
         return Decoded(picture.number, picture.pixels) if show else None
 
     def _is_old(self, picture: UvlcPicture) -> bool:
-        """Return whether an image repeats the newest one or is older."""
+        """Return whether an image is older than, or the same as, the newest one."""
         return self._number is not None and 0 <= (self._number - picture.number) % (1 << 32) < REORDERED
 
 
@@ -330,7 +330,7 @@ def _codec_name(codec: int) -> str:
 class EncodedStream:
     """Relays H.264 while a recorder subscribes; see :class:`StreamRelay`. Used by the reading thread.
 
-    Frames arrive complete, over TCP, so they need not be decoded to check that.
+    Frames arrive complete over TCP, so they need not be decoded to check for missing data.
     """
 
     def __init__(
@@ -340,7 +340,7 @@ class EncodedStream:
         self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
     def take(self, coded: Coded) -> None:
-        """Relay a complete frame if it is H.264, was requested, and can be decoded after the last one relayed."""
+        """Relay a complete frame if it is H.264, was requested, and can be decoded after the last relayed frame."""
         frame = coded.data
         if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC:
             self._relay.restart()

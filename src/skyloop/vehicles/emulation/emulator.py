@@ -153,7 +153,7 @@ class DatagramPort:
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram. As usual with UDP, it is lost if the buffer is full or there is no receiver."""
+        """Send a datagram. As usual with UDP, the datagram is lost if the buffer is full or there is no receiver."""
         for each in self._outward.packets(datagram):
             self._later(partial(self._send, each, to))
 
@@ -207,7 +207,7 @@ _BUFFER: Final = 1 << 16
 
 
 class ByteServer:
-    """Serves one client at a time. Meanwhile the next one waits in the kernel's backlog, connected but unanswered.
+    """Serves one client at a time. Meanwhile, the next client stays connected but unanswered in the kernel's backlog.
 
     Use only on the loop's thread.
     """
@@ -288,8 +288,8 @@ class RunningEmulator(ABC):
     """Firmware that runs from its construction to :meth:`stop`, which is also called if the constructor fails halfway.
 
     State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
-    read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, which its
-    creator starts after the firmware and stops before it.
+    only read values that are replaced as a whole. ``loop`` is the name for the loop's thread, or a shared loop, whose
+    creator starts it after the firmware and stops it before the firmware.
     """
 
     def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:
@@ -302,7 +302,7 @@ class RunningEmulator(ABC):
         self._posted = False
 
     def stop(self) -> None:
-        """Switch the firmware off. Its ports are free when this returns."""
+        """Switch the firmware off. The firmware's ports are free when this returns."""
         self._host.detach(self._drone, self)
         if self._video is not None:
             self._video.stop()
@@ -326,7 +326,7 @@ class RunningEmulator(ABC):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Store the drone's newest estimate for the loop's thread, replacing one not yet handled."""
+        """Store the drone's newest estimate for the loop's thread, replacing any that has not been handled yet."""
         self._report = report
         if not self._posted:
             self._posted = True
@@ -362,7 +362,7 @@ R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone in a host's world. As a context manager, it is switched on within the block."""
+    """The firmware of one drone in a host's world. As a context manager, the firmware is on within the block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host
@@ -370,13 +370,13 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch the firmware on. Everything except its ports is reset."""
+        """Switch the firmware on. Everything except the ports is reset."""
         if self._running is not None:
             raise UsageError("this firmware is already running")
         self._running = self._switched_on()
 
     def stop(self) -> None:
-        """Switch the firmware off at once, even during an activity. Does nothing if it is already off.
+        """Switch the firmware off at once, even during an activity. Does nothing if the firmware is already off.
 
         The vehicle continues to follow its last command. The ports are free when this returns.
         """

@@ -88,7 +88,7 @@ class Packer(Protocol[S_contra]):
 class VideoEncoding(Generic[S]):
     """Encodes on a separate thread. Of the images that arrive during encoding, only the newest is kept.
 
-    ``packer`` is used and ``send`` called, with each encoded image, only on that thread; ``settings`` on any.
+    Only that thread uses ``packer`` and calls ``send`` with each encoded image; any thread may call ``settings``.
     """
 
     def __init__(self, packer: Packer[S], settings: Callable[[], S], send: Callable[[Piece], None]) -> None:
@@ -160,7 +160,7 @@ class VideoEncoding(Generic[S]):
 
 
 def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a copy of an image with another one, scaled down to (width, height), in its upper left corner."""
+    """Return a copy of an image with another image, scaled down to (width, height), in its upper left corner."""
     width, height = size
     rows = np.arange(height) * other.shape[0] // height
     columns = np.arange(width) * other.shape[1] // width

@@ -1,6 +1,6 @@
 """Differences between ArduCopter and PX4 in modes, commands, thrust and safety nets. Pure.
 
-``docs/mavlink.md`` says where each difference was observed.
+``docs/mavlink.md`` describes where each difference was observed.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _SafetyNet:
     name: str  #: name of the parameter
     what: str
     good: Callable[[float], bool]  #: returns whether a value is safe
-    otherwise: str  #: consequence of a value that is not safe
+    otherwise: str  #: consequence of an unsafe value
     advised: float  #: a safe value
     unit: str = ""
 
@@ -122,8 +122,8 @@ class AutopilotProfile(ABC):
     TAKING_OFF: ClassVar[frozenset[str]]
     NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that are flown with a remote control
     LEAD_S: ClassVar[float]  #: how long set-points must arrive before the vehicle enters GUIDED
-    BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if its capabilities do not say
-    EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that it uses to convert latitude and longitude
+    BYTEWISE: ClassVar[bool]  #: whether integers are written bytewise if the capabilities do not specify it
+    EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that the autopilot uses to convert latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
     @abstractmethod
@@ -138,7 +138,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether a take-off is complete; ``rose``: whether it has been airborne since accepting it."""
+        """Return whether a take-off is complete; ``rose``: whether the vehicle has been airborne since accepting it."""
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
@@ -153,9 +153,9 @@ class AutopilotProfile(ABC):
         """Return the model that turns climb rates into thrust."""
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
-        """Return a diagnostic for each safety net for which this autopilot has a parameter.
+        """Return a diagnostic for each safety net that one of this autopilot's parameters controls.
 
-        By default, both autopilots only stop following the last set-point if this computer or its link fails.
+        By default, if this computer or its link fails, both autopilots merely stop following the last set-point.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 
@@ -228,7 +228,7 @@ class ArduCopterProfile(AutopilotProfile):
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:
-        """Return diagnostics for the safety nets, and for whether the vehicle monitors our heartbeats."""
+        """Return diagnostics for the safety nets and for the vehicle's monitoring of our heartbeats."""
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
@@ -286,7 +286,7 @@ class Px4Profile(AutopilotProfile):
             return None
         nan = math.nan
         amsl_m = vehicle.amsl_m - (vehicle.altitude_m or 0.0) + height_m
-        # Rounded to decimetres, so that altitude noise on the ground does not turn a repeat into a new command.
+        # The altitude is rounded to decimetres, so that noise on the ground does not turn a repeat into a new command.
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002
@@ -297,7 +297,7 @@ class Px4Profile(AutopilotProfile):
         """Return whether the vehicle can be armed; None while it does not report that.
 
         PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
-        allow arming, such as one left over from a flight, the outcome does not apply to the mode in which a take-off
+        allow arming (it may be left over from a flight), the outcome does not apply to the mode in which a take-off
         begins. In that case only the position estimate is checked.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)

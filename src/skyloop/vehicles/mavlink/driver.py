@@ -80,7 +80,7 @@ class MavlinkDriver(Driver):
         return self._opened().command(action, new=False)
 
     def left_to(self) -> str:
-        """Return the mode that a remote control, a ground station or the autopilot itself has chosen, if one has."""
+        """Return the mode chosen by a remote control, a ground station or the autopilot itself, if any."""
         link = self._link
         setpoints = link.session.setpoints if link is not None else None
         return "" if setpoints is None else setpoints.ownership.others

@@ -206,7 +206,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
                 self.session.receive(data, peer, now_ns, whole=connection.whole)
 
     def _send_due(self, now_ns: int) -> None:
-        """Send the packets that are due. Call it with the lock held, from any thread."""
+        """Send the packets that are due. May be called from any thread, with the lock held."""
         packets = self.session.poll(now_ns)
         connection = self._connection
         if connection is None or self._broken:

@@ -24,9 +24,9 @@ POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
 ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitude set-points, each with a new heading in a turn: 50 Hz
-MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
-STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of a speed of zero
-STOPPING_S: Final = 3.0  #: time after which it holds its position in any case
+MOST_YAW_LEAD_RAD: Final = 0.5  #: maximum lead of the requested heading over a vehicle that can't keep up
+STOPPED_M_S: Final = 0.25  #: speed below which a vehicle holds its position instead of following a velocity of zero
+STOPPING_S: Final = 3.0  #: time after which the vehicle holds its position in any case
 MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, used after a pause in the ticks
 WAY_M_S: Final = 1.0  #: default speed to a position
 WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
@@ -103,15 +103,15 @@ class PositionSetpoint:
     def replace(self, action: Position) -> None:
         """Fly to another position, starting from where the vehicle is now."""
         if self.action.yaw is not None and action.yaw is None:
-            self._keep_yaw = None  # keep its present heading
+            self._keep_yaw = None  # keep the vehicle's present heading
         self.action = action
 
     def hold_back(self) -> None:
-        """Restart from the vehicle's position, because it is not following yet."""
+        """Restart from the vehicle's present position, because the vehicle is not following yet."""
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due; it is a velocity of zero while the position or heading is unknown."""
+        """Return the set-point if one is due; the velocity is zero while the position or heading is unknown."""
         if vehicle.position is None or vehicle.yaw is None:
             self.hold_back()
             return velocity_message(Velocity(), target)
@@ -195,9 +195,9 @@ ARM_PACE_S: Final = 1.0  #: time between repeated commands to arm or take off
 ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted without a confirming heartbeat
 LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the vehicle, if at all (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
-LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report one
-CUT_SHORT: Final = 0.5  #: fraction of its height below which a hold means that another operator stopped a take-off
-CUT_SHORT_M: Final = 1.05  #: minimum shortfall for that: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
+LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report a lift-off
+CUT_SHORT: Final = 0.5  #: a hold below this fraction of the height means that another operator stopped a take-off
+CUT_SHORT_M: Final = 1.05  #: and the minimum shortfall: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
 STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
 
@@ -205,17 +205,17 @@ STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a cli
 class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
-    Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
-    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request;
-    ``disarms`` says whether the vehicle was found armed and our unfinished landing may still disarm it.
+    Each step requests what is missing: the mode for arming, then arming, then the command. Refusals are reported in the
+    vehicle's own words, and refused steps are retried while the take-off is requested. ``asked_ns`` is the time of the
+    last request; ``disarms`` is whether the vehicle was found armed and our unfinished landing may still disarm it.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
-        self.given_up = ""  #: why the take-off was given up; empty if it was not
+        self.given_up = ""  #: why the take-off was given up; empty if it was not given up
         self.taken_over = False  #: whether another operator chose a mode in the air
-        self.declined = False  #: whether it was given up because another operator chose a mode before it was armed
+        self.declined = False  #: whether the take-off was given up because another operator chose a mode before arming
         self.rose = False  #: whether the vehicle has left the ground
         self.lead_ns: int | None = None  #: when set-points began to be sent
         self.reason = ""  #: the vehicle's own reason for refusing to arm
@@ -223,7 +223,7 @@ class TakeoffSequence:
         self._height_m = height_m
         self._begun_ns = now_ns
         self._disarms = disarms
-        self._armed_ns: int | None = None  # when it was first seen armed, or arming was acknowledged
+        self._armed_ns: int | None = None  # when the vehicle was first seen armed or acknowledged arming
         self._climb_command: VehicleCommand | None = None
         self._best_m = -1.0
         self._best_ns = now_ns
@@ -232,10 +232,10 @@ class TakeoffSequence:
         self._ground_m: float | None = None
         self._other_ns: int | None = None
         self._sent_ns = 0
-        self._seen = not autopilot.TAKING_OFF  # whether its take-off mode, if it has one, was seen
-        self.refused = ""  #: why it is not armed yet
-        self.arm_asked_ns: int | None = None  #: when arming was last requested; None if it was already armed
-        self._arming_ns: int | None = None  # first arming request; earlier replies belong to the landing's disarming
+        self._seen = not autopilot.TAKING_OFF  # whether the vehicle's take-off mode, if it has one, was seen
+        self.refused = ""  #: why the vehicle is not armed yet
+        self.arm_asked_ns: int | None = None  #: when arming was last requested; None if the vehicle was already armed
+        self._arming_ns: int | None = None  # first arming request; earlier replies are to the landing's disarming
         self._ready = False  # was in take-off mode, armed or about to be: any other mode is another operator's choice
 
     @property
@@ -290,7 +290,7 @@ class TakeoffSequence:
         self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
-        if not vehicle.armed and not self.started:  # our previous landing disarmed it before this flight began
+        if not vehicle.armed and not self.started:  # our previous landing disarmed the vehicle before this flight began
             self._armed_ns, self._climb_command, self._disarms = None, None, False
         elif not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
             self.given_up = "the vehicle disarmed itself"
@@ -303,12 +303,12 @@ class TakeoffSequence:
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
-            self.done = True  # its reported altitude has stopped rising
+            self.done = True  # the vehicle's reported altitude has stopped rising
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 
     def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
-        """Return whether our previous landing can no longer disarm it, so that a later disarming has another cause."""
+        """Return whether our last landing can no longer disarm the vehicle, so a later disarming has another cause."""
         accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
         return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS
 

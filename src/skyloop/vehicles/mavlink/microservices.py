@@ -21,7 +21,7 @@ from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
-MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
+MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported: a hostile sender can invent any number of them
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
 #: MAV_TYPE of each kind of aircraft that hovers on several rotors.
@@ -40,7 +40,7 @@ class VehicleIdentity:
 class VehicleSelector:
     """Selects one vehicle among all whose heartbeats are received.
 
-    Without a system id, it selects the first system found and keeps it from then on.
+    Without a system id, the first system found is selected and kept from then on.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -49,12 +49,12 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen one, which may have moved there
+        self._elsewhere: set[VehicleIdentity] = set()  # heard from since the chosen vehicle, which may have moved there
         self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, heard from at the same time
         self._received_ns = 0  # when the chosen vehicle was last heard from
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
-        """Handle a message; return events about other vehicles, or about the chosen one's move to another port."""
+        """Handle a message; return events about other vehicles, or about the chosen vehicle's move to another port."""
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
         if self.chosen == found:
             self._received_ns = now_ns
@@ -287,7 +287,7 @@ class VehicleClock:
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
-        """Return when the stamped state was captured, never later than it arrived nor earlier than the previous one."""
+        """Return the capture time of the stamped state, limited to between the previous capture time and arrival."""
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns
@@ -311,8 +311,8 @@ _NAN: Final = math.nan
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     """Convert an external pose to a message.
 
-    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. Its
-    time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
+    The message has north, east, down [m], and the angles [rad] of a body with forward, right and down axes. The
+    message's time is in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)
@@ -329,7 +329,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
 
 
 def _covariance(pose: ExternalPose) -> list[float]:
-    """Return the upper right triangle for x, y, z, roll, pitch, yaw; the first number is NaN if it is unknown."""
+    """Return the upper right triangle for x, y, z, roll, pitch, yaw; NaN if the standard deviations are unknown."""
     if pose.position_std_m is None or pose.attitude_std_rad is None:
         return [_NAN] * 21
     variances = [pose.position_std_m**2] * 3 + [pose.attitude_std_rad**2] * 3

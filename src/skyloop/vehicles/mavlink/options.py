@@ -103,7 +103,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class CameraOptions:
-    """A camera separate from the autopilot. Its size and rate are announced before the first frame arrives."""
+    """A camera separate from the autopilot. The image size and rate are announced before the first frame arrives."""
 
     source: str = field(repr=False)  # may contain credentials
     name: str
@@ -121,7 +121,7 @@ class MavlinkOptions:
     address: Address
     system: int | None = None  #: the vehicle's system id; None for the first one found
     component: int = 1  #: the autopilot's component id, by default MAV_COMP_ID_AUTOPILOT1
-    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None for the sender of its first packet
+    peer: tuple[str, int] | None = None  #: address the vehicle sends from; None for the sender of its first packet
     own_system: int = 255
     rate_hz: float = 50.0  #: rate of attitude, position and velocity
     limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: the driver's limits by parameter name
@@ -165,7 +165,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
 
 
 def address_of(uri: VehicleUri) -> Address:
-    """Parse the part of an address that says where the vehicle is."""
+    """Parse the part of an address that specifies how to reach the vehicle."""
     word, _, rest = uri.place.partition(":")
     if word not in [kind.value for kind in ConnectionKind]:
         raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
@@ -286,7 +286,7 @@ def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
 
 
 def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
-    """Return a receiver for the camera, not started yet."""
+    """Return a receiver for the camera; the receiver is not started yet."""
     settings = LiveCameraSettings(
         source(uri, options),
         options.name,

@@ -1,4 +1,4 @@
-"""Control of the vehicle by this program, another operator, or the vehicle's own failsafe. Pure.
+"""Tracks who controls the vehicle: this program, another operator, or the vehicle's own failsafe. Pure.
 
 A remote control, a ground station or the autopilot itself may change the mode. Skyloop leaves the vehicle in a mode
 that it did not choose; only a new action from an application takes the vehicle back.
@@ -21,12 +21,12 @@ _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
-    """Decides who is flying, based on the modes that the vehicle reports and those requested here."""
+    """Decides who is flying, based on the modes that the vehicle reports and the modes requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
         self.left_to = ""  #: foreign mode that now flies the vehicle; empty if we fly it or there is no pilot
         self._autopilot = autopilot
-        self._by_itself = False  # its own failsafe chose the mode, so we may still hold or land the vehicle
+        self._by_itself = False  # whether its own failsafe chose the mode, in which we may still hold or land it
         self._steering = False  # whether this program started or took over the flight
         self._from = ""  # the mode at the time of the last decision; empty once one of our modes has been reported
         self._foreign_ns: int | None = None  # when the vehicle entered a mode that was not chosen here
@@ -49,7 +49,7 @@ class FlightOwnership:
         return not self._is_left_to_nobody(vehicle)
 
     def _is_left_to_nobody(self, vehicle: VehicleState) -> bool:
-        """Return whether its failsafe chose a mode in which it sinks unless a pilot is at the sticks."""
+        """Return whether the vehicle's failsafe chose a mode in which it sinks unless a pilot is at the sticks."""
         return vehicle.failsafe and vehicle.mode in self._autopilot.NEEDS_STICKS and not vehicle.remote
 
     # Decisions ---------------------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ class FlightOwnership:
             self._from = ""
 
     def observe(self, vehicle: VehicleState, now_ns: int) -> bool:
-        """Return whether a vehicle that we were flying is in a foreign mode, in which nothing is sent to it."""
+        """Return whether a vehicle that we were flying is in a foreign mode, so that nothing is sent to it."""
         if not self._steering or not self.is_foreign(vehicle):
             self._foreign_ns = None
             self.on_mode(vehicle.mode)

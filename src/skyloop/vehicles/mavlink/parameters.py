@@ -17,7 +17,7 @@ from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-QUIET_NS: Final = nanoseconds(0.7)  #: time without a new parameter after which missing ones are requested
+QUIET_NS: Final = nanoseconds(0.7)  #: time without a new parameter after which the missing parameters are requested
 AT_ONCE: Final = 20  #: number of missing parameters requested at once
 LIST_NS: Final = nanoseconds(3.0)  #: time between requests for the list while nothing arrives
 GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
@@ -45,7 +45,7 @@ class _PendingWrite:
 
 
 class ParameterExchange:
-    """Reads and writes one vehicle's parameters. ``bytewise`` says whether integers are encoded bytewise."""
+    """Reads and writes one vehicle's parameters. ``bytewise``: whether integers are encoded bytewise."""
 
     def __init__(self) -> None:
         self.target = (1, 1)
@@ -73,7 +73,7 @@ class ParameterExchange:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter in the autopilot's unit; by the deadline, ``done`` is called with the failure or None."""
+        """Write a parameter in the autopilot's unit; call ``done`` by the deadline with the failure or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property
@@ -137,7 +137,7 @@ class ParameterExchange:
                 kind = self.reported[write.name].kind
                 try:
                     field = to_field(write.value, kind, bytewise=self.bytewise)
-                except struct.error as error:  # its type has changed since the request
+                except struct.error as error:  # the parameter's type has changed since the request
                     self._writes.remove(write)
                     write.done(f"{write.value:g} does not fit: {error}")
                     continue
@@ -153,7 +153,7 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the written value, compared in single precision unless ``exact``."""
+    """Return whether the vehicle reports the written value, comparing in single precision unless ``exact`` is True."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
@@ -245,7 +245,7 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a parameter to be written; raise an error if it is unknown or read-only."""
+    """Return a parameter to be written; raise an error if the parameter is unknown or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
@@ -289,7 +289,7 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
     else:
         least, most = -math.inf, math.inf
         value, kind = rounded(held.value), ParameterType.FLOAT
-    # A value outside the range shows that the vehicle's own range is wider.
+    # A reported value outside this range means that the vehicle itself allows a wider range.
     low = _bound(min(meaning.low if meaning.low is not None else least, value))
     high = _bound(max(meaning.high if meaning.high is not None else most, value))
     text = meaning.text or f"the autopilot's {held.name}"

@@ -45,7 +45,7 @@ REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session, for hear
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: longer than the failsafes wait (5 to 10 s)
 QUIET_NS: Final = nanoseconds(0.5)  #: time without data until set-points are withheld: they might be followed late
-OLD_POSE_NS: Final = nanoseconds(0.5)  #: age beyond which a pose no longer says where the vehicle is
+OLD_POSE_NS: Final = nanoseconds(0.5)  #: age beyond which a pose no longer gives the vehicle's position
 DEGRADED_NS: Final = nanoseconds(1.2)  #: time without data after which the link counts as degraded
 LOST_NS: Final = nanoseconds(2.5)  #: time without data after which the link counts as lost
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: time without any data after which a vehicle is reported as lost
@@ -57,7 +57,7 @@ VERSION_PACE_S: Final = 1.0  #: time between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
-_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
+_STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps reveal their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that carry the mode
 
 #: Safety commands, which are sent before everything else.
@@ -105,8 +105,8 @@ class MavlinkSession(VehicleSession):
         self.parameters = ParameterExchange()
         self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
-        self.autopilot: AutopilotProfile | None = None  #: None until recognised, and if unknown
-        self.setpoints: SetpointController | None = None  #: None until the autopilot is known, and if it can't be flown
+        self.autopilot: AutopilotProfile | None = None  #: None if unknown or not recognised yet
+        self.setpoints: SetpointController | None = None  #: None until the autopilot is known, or if it can't be flown
         self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own limits
         self.dropped = 0  #: number of packets that the connection dropped because its buffer was full
@@ -124,13 +124,13 @@ class MavlinkSession(VehicleSession):
         self._signed = 0
         self._unencodable: set[str] = set()  # message types already reported as not encodable
         self._kind: tuple[int, int] | None = None  # autopilot and vehicle type, from the heartbeat
-        self._known_as: Message | None = None  # version from before the link was lost, kept until it arrives again
-        self._receives_us = True  # False until the vehicle shows that it receives us
+        self._known_as: Message | None = None  # version from before the link loss, kept until a new one arrives
+        self._receives_us = True  # False until there is a sign that the vehicle receives our messages
         self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed and MAV_STATE when last checked
-        self._waking = False  # whether it has just booted and can't be armed yet
-        self._prearm = ""  # the latest reason that it gave for refusing to arm
+        self._waking = False  # whether the vehicle has just booted and can't be armed yet
+        self._prearm = ""  # the vehicle's latest reason for refusing to arm
         self._unsupported_reason = "no data from it"
-        #: Acts on whichever vehicle answers, because an emergency stop must survive the loss of the vehicle's state.
+        #: It acts on whichever vehicle answers, because an emergency stop must survive the loss of the vehicle's state.
         self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
@@ -153,7 +153,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Also raises if the vehicle can't be flown."""
+        """Accept an action; see :meth:`SetpointController.apply`. Raises an error if the vehicle can't be flown."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found at any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -161,7 +161,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # it has no effect, and pilots send it continuously on the ground
+            return action  # this action has no effect, and pilots send it continuously on the ground
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
@@ -172,10 +172,10 @@ class MavlinkSession(VehicleSession):
         return applied
 
     def pose_problem(self, captured_ns: int, now_ns: int) -> str:
-        """Return why an external pose can't be sent now; empty if it can.
+        """Return why an external pose can't be sent now; empty if the pose can be sent.
 
         While the vehicle is silent, a pose might wait in a buffer. Once the vehicle resumes reading, an autopilot that
-        timestamps poses on arrival would mistake it for a new one.
+        timestamps poses on arrival would mistake the delayed pose for a new one.
         """
         if self._received_ns is None:
             return "no data from the vehicle: an external pose can't be sent until the link is up"
@@ -210,7 +210,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes from a peer; ``whole`` if they are one datagram. Never raises, whatever the content."""
+        """Handle bytes from a peer; ``whole`` is True if they are one datagram. Never raises, whatever the content."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
@@ -354,7 +354,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None and vehicle is not None:
             messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
         if not self._receives_us:
-            messages = []  # there is no sign yet that it receives us
+            messages = []  # there is no sign yet that the vehicle receives our messages
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:
@@ -446,7 +446,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None:
             self.setpoints.on_link_lost()
         self.clock = VehicleClock()
-        self._publish(self.clock.now(now_ns), now_ns)  # report that its present state is unknown
+        self._publish(self.clock.now(now_ns), now_ns)  # report that the vehicle's present state is unknown
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
@@ -472,7 +472,7 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        """Set up a new vehicle, discarding everything known about any other."""
+        """Set up a new vehicle, discarding everything known about any other vehicle."""
         if self._kind is not None:
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             self._publish_event(event_of(text, "another", Severity.WARNING, system=heartbeat.get_srcSystem()))
@@ -528,8 +528,8 @@ class MavlinkSession(VehicleSession):
 
 
 def _is_same(one: Message, other: Message) -> bool | None:
-    """Return whether two ``AUTOPILOT_VERSION`` are from the same vehicle; None if no serial number can be compared."""
-    if any(one.uid2) and any(other.uid2):  # MAVLink 1 does not transmit it
+    """Return whether two version messages are from the same vehicle; None if no serial number can be compared."""
+    if any(one.uid2) and any(other.uid2):  # MAVLink 1 does not transmit ``uid2``
         return list(one.uid2) == list(other.uid2)
     return bool(one.uid == other.uid) if one.uid and other.uid else None
 

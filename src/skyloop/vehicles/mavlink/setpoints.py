@@ -2,7 +2,7 @@
 
 Set-points are streamed only while a pilot is at the controls and the vehicle is in the mode that follows them. A
 failsafe, a lost link or another operator's mode change (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the
-stream, after which only the vehicle's own safety nets fly it.
+stream, after which only the vehicle's own safety nets control it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
-SETTLING_NS: Final = nanoseconds(3.0)  #: time at its height after which a take-off counts as complete in any mode
+SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off counts as complete in any mode after this time at its height
 DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after the vehicle was last seen armed
 IDLES_NS: Final = nanoseconds(12.0)  #: time within which an autopilot left armed on the ground disarms itself
 STEP_NS: Final = nanoseconds(0.04)  #: time between steps of a take-off or landing while they only wait
@@ -61,7 +61,7 @@ HURRY_NS: Final = nanoseconds(0.008)  #: minimum time between a new set-point an
 class Goal(Enum):
     """The vehicle's task."""
 
-    NOTHING = auto()  #: no goal of ours: the vehicle is left to itself and to other operators
+    NOTHING = auto()  #: no goal: the vehicle is left to itself or to other operators
     TAKE_OFF = auto()
     FOLLOW = auto()  #: follow streamed set-points, including hovering
     HOLD = auto()  #: hold position without streaming set-points
@@ -109,7 +109,7 @@ class SetpointController:
     def apply(
         self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
     ) -> AnyAction:
-        """Accept an action; return the action in force, which is idle if it is ignored.
+        """Accept an action; return the action in force, which is idle if the action is ignored.
 
         While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused
         and all other actions are ignored. ``alone``: whether a failsafe requested it while no pilot was in command;
@@ -138,12 +138,12 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns, new=new)
         elif isinstance(action, Land):
-            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats respect foreign modes
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # foreign modes are respected
                 self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
         else:
-            assert not isinstance(action, ReturnToStart)  # the proxy turns it into positions
+            assert not isinstance(action, ReturnToStart)  # the proxy converts this action to positions
             action = self._steer(action, vehicle, now_ns)
         if vehicle is None and new and not alone and isinstance(action, Hover | Land):
             self._blind_until_ns = now_ns + KEPT_NS
@@ -176,7 +176,7 @@ class SetpointController:
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            if now_ns < self._disarms_until_ns:  # the previous take-off has armed it or may still do so
+            if now_ns < self._disarms_until_ns:  # the previous take-off has armed the vehicle or may still do so
                 takeoff.arm_asked_ns = now_ns
             self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
@@ -228,7 +228,7 @@ class SetpointController:
             action = self._setpoint.within(action)
             self._setpoint.action = action
         if now_ns - self._sent_ns >= HURRY_NS:
-            self._sent_ns = 0  # send it at once
+            self._sent_ns = 0  # send the new set-point at once
         return action
 
     def _follow(self, setpoint: Setpoint) -> None:
@@ -281,7 +281,7 @@ class SetpointController:
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._arms_until_ns is not None and not vehicle.airborne:
-            return FlightState.LANDING  # it is armed, or may be at any moment
+            return FlightState.LANDING  # the vehicle is armed, or may be at any moment
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and self._takeoff.started:
             return FlightState.TAKING_OFF
         if vehicle.airborne is None:
@@ -313,8 +313,8 @@ class SetpointController:
     def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
         """Return the set-points that are due, and pass commands to the command sender.
 
-        ``read`` says whether the vehicle seems to read commands promptly, judging by its messages. If not, a changed
-        velocity might wait in a buffer and take effect late, so only a stop is sent, which is harmless even then.
+        ``read``: whether the vehicle seems to process commands promptly, judging by its messages. If not, a changed
+        velocity might wait in a buffer and take effect late, so only a stop is sent, which is harmless even when late.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
@@ -356,7 +356,7 @@ class SetpointController:
         return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and (stops or isinstance(setpoint, PositionHold)))
 
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Send an emergency stop that is due, even if nothing is being received; return whether one is in force."""
+        """Send an emergency stop if one is due, even if nothing is being received; return whether one is in force."""
         if not self.stop.active:
             return False
         shown = None
@@ -415,7 +415,7 @@ class SetpointController:
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
         """Disarm the vehicle after a take-off that failed or was interrupted by a lost link.
 
-        A vehicle that is rising or in another mode was armed by another operator.
+        If the vehicle is rising or in another mode, another operator armed it.
         """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
@@ -460,7 +460,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle in a foreign mode; return whether we may still hold or land it."""
+        """Leave the vehicle in a mode that someone else chose; return whether we may still hold or land the vehicle."""
         why = "its own failsafe" if vehicle.failsafe else "not chosen here"
         self._notify(f"the vehicle changed to {vehicle.mode} ({why}): no more set-points are sent", reason="mode")
         self._end()
@@ -475,7 +475,7 @@ class SetpointController:
             return []
         self._ask_for(self._autopilot.HOLD, now_ns)
         if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
-            self._sent_ns = now_ns  # stop it until the mode is reported, or if the mode is refused
+            self._sent_ns = now_ns  # stop the vehicle until the mode is reported, or if the mode is refused
             return [velocity_message(Velocity(), self._commands.target)]
         return []
 
@@ -483,7 +483,7 @@ class SetpointController:
         inside = vehicle.mode in self._autopilot.LANDING
         arms_until_ns = self._arms_until_ns
         if vehicle.armed and arms_until_ns is not None:
-            self._arms_until_ns = 0  # the late arming has happened: once disarmed, it stays disarmed
+            self._arms_until_ns = 0  # the late arming has happened: once disarmed, the vehicle stays disarmed
         if not vehicle.armed and (arms_until_ns is None or vehicle.heartbeat_ns >= arms_until_ns):
             self._flight_is_over()
         elif vehicle.airborne is False:

@@ -32,19 +32,19 @@ class VehicleState:
     armed: bool
     status: int  #: MAV_STATE from the heartbeat
     landed: Landed
-    ready: bool | None  #: whether it can be armed; None if unknown
-    position: Vector | None  #: position relative to its origin [m]
+    ready: bool | None  #: whether the vehicle can be armed; None if unknown
+    position: Vector | None  #: position relative to the vehicle's origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
-    altitude_m: float | None  #: height above its start, or the closest equivalent that it reports
+    altitude_m: float | None  #: height above the vehicle's start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
-    remote: bool = False  #: whether it reports that it receives a remote control
-    heartbeat_ns: int = 0  #: arrival time of its newest heartbeat, which says whether it is armed
-    reports_landed: bool = False  #: whether it has ever reported whether it is on the ground
+    remote: bool = False  #: whether the vehicle reports that it receives a remote control
+    heartbeat_ns: int = 0  #: arrival time of the vehicle's newest heartbeat, which reports whether it is armed
+    reports_landed: bool = False  #: whether the vehicle has ever reported being on the ground or in the air
 
     @property
     def airborne(self) -> bool | None:
-        """Whether it is off the ground under its own power; None if unknown.
+        """Whether the vehicle is off the ground under its own power; None if unknown.
 
         An armed vehicle may be flying if it reports neither flight nor height, for example just after being found
         again, or if it is low and its own report is late.
@@ -70,7 +70,7 @@ class Telemetry:
         self._newest: dict[str, tuple[Message, int]] = {}  # by kind, from the lowest-numbered current instance
         self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # by kind and number, where there are several
         self._ground_down: float | None = None  # how far the ground is below the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; and that place on Earth
+        self._on_earth: tuple[Vector, Message] | None = None  # position east, north, up, and the same place on Earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Store a message from the selected vehicle."""
@@ -115,7 +115,7 @@ class Telemetry:
     # Meaning -----------------------------------------------------------------------------------------------------
 
     def custom_mode(self) -> int | None:
-        """Return the mode number from the newest message that has one."""
+        """Return the mode number from the newest message that contains a mode."""
         heartbeat, current = self._newest.get("HEARTBEAT"), self._newest.get("CURRENT_MODE")
         if heartbeat is None:
             return None
@@ -164,7 +164,7 @@ class Telemetry:
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix and both positions.
+        """Return the position on Earth of the axes' origin; None without a 3-D satellite fix and both positions.
 
         Without a fix, an autopilot's origin may be arbitrary, as with motion capture.
         """
@@ -199,7 +199,7 @@ class Telemetry:
         return None if message is None else message.alt / 1000.0
 
     def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
-        """Return the vehicle's state; ``ready`` says whether it can be armed, None if unknown."""
+        """Return the vehicle's state; ``ready`` is whether the vehicle can be armed, or None if that is unknown."""
         attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
@@ -364,7 +364,7 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until it is reported airborne (PX4: once per second)
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until the vehicle reports it (PX4: once per second)
 
 
 class HealthMonitor:
@@ -374,17 +374,17 @@ class HealthMonitor:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
         self._reasons: set[str] = set()  # reasons for refusing to arm, already reported during this boot
-        self._airborne_ns: int | None = None  # when it took off
+        self._airborne_ns: int | None = None  # when the vehicle took off
 
     @property
     def was_ready(self) -> bool:
-        """Whether it has ever been ready to arm."""
+        """Whether the vehicle has ever been ready to arm."""
         return "was_ready" in self._reported
 
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
         """Handle a ``STATUSTEXT``; return complete texts, with reasons for refusing to arm marked as such.
 
-        While the vehicle boots (``quiet``), it repeats these reasons, but each is reported only once.
+        While the vehicle boots (``quiet``), it repeats these reasons, but each reason is reported only once.
         """
         events = []
         for severity, text in self._texts.on_message(message):
@@ -418,7 +418,7 @@ class HealthMonitor:
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
-                # PX4 reports a constant position while on the ground; in the air that means the position is lost.
+                # PX4 reports a constant position while on the ground; in the air that means that the position is lost.
                 counts = kind != "ESTIMATOR_STATUS" or risen
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
                 events += self._changed(

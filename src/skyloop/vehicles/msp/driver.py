@@ -48,7 +48,7 @@ class MspDriver(Driver):
                 import serial  # noqa: F401  fails now if it is missing; the link's thread imports it to open the port
             except ImportError as error:
                 raise MissingExtraError(f"{self.uri}", EXTRA, cause=str(error)) from error
-        known = SetpointController(self.options.override)  # only to keep settings and learnt values
+        known = SetpointController(self.options.override)  # used only to keep settings and learnt values
         known.limits, known.gains, known.given_aux = (
             self._setpoints.limits,
             self._setpoints.gains,
@@ -69,7 +69,7 @@ class MspDriver(Driver):
         return self._opened().command(action)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse a take-off if the flight controller can't be armed; otherwise let the next climb start it."""
+        """Refuse a take-off if the flight controller can't be armed; otherwise let the next climb start a take-off."""
         if isinstance(action, Takeoff):
             why = self._opened().ask_takeoff()
             if why:

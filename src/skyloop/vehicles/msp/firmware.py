@@ -33,8 +33,8 @@ from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Func
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
 MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
-USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode needs
-_ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
+USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode uses
+_ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in Betaflight and INAV
 LONG_DELAY_S: Final = 2.0  #: delay of a failsafe above which a warning is given
 CURVED_API: Final = (1, 46)  #: API version (Betaflight 4.5) from which a stick's tilt follows its rate curve
 _PROCEDURES: Final = {
@@ -47,7 +47,7 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """A flight controller's settings; None for those not reported."""
+    """A flight controller's settings; a setting that was not reported is None."""
 
     identity: Identity = field(default_factory=Identity)
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
@@ -96,7 +96,7 @@ class Setup:
 
     @property
     def aux_channels(self) -> int:
-        """The number of AUX channels to send; the firmware itself would choose the value of any missing one."""
+        """The number of AUX channels to send; the firmware would choose its own value for any missing channel."""
         used = max((each.aux + 1 for each in self.ranges), default=0)
         return min(MOST_AUX, max(LEAST_AUX, used))
 
@@ -166,7 +166,7 @@ class Setup:
     # Fitness for flight ------------------------------------------------------------------------------------------
 
     def diagnose(self, *, override: bool) -> list[Diagnostic]:
-        """Return diagnostics about what the settings mean for a flight. Severe ones prevent arming."""
+        """Return diagnostics about what the settings mean for a flight. Severe diagnostics prevent arming."""
         name = Diagnostic("firmware", True, str(self.identity))
         return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
 

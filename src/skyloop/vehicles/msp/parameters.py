@@ -73,7 +73,7 @@ _GAINS: Final = (
 TILT: Final = "msp.full_stick.tilt"
 HOVER: Final = "msp.hover_throttle"
 AUX: Final = "msp.aux"
-#: Parameter, the controller's field (None for 0), maximum, unit and description.
+#: Each parameter, the controller's field (None for 0), the maximum, unit and description.
 _LEARNT: Final = (
     (TILT, "full_tilt_rad", 1.5, "rad", "lean of a full stick in ANGLE mode; 0: the flight controller's angle_limit"),
     (HOVER, "hover", 0.9, "", "hover throttle as a share of full throttle, learnt in flight; 0: unknown"),

@@ -35,7 +35,7 @@ LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link cou
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time without a reply after which a flight controller is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
 MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: age at which an unacknowledged frame is lost if a newer reply has arrived
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older unacknowledged frame is lost if a newer reply has arrived
 LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
 UNTOLD_NS: Final = nanoseconds(0.5)  #: time without sticks after which it arms only once the arm switch has been off
@@ -63,7 +63,7 @@ class MspSession(VehicleSession):
         self.options = options
         self.setpoints = setpoints or SetpointController(options.override)
         self.motion = MotionEstimate()
-        self.setup: Setup | None = None  #: None until it has been read
+        self.setup: Setup | None = None  #: None until the setup has been read
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: rate of acknowledged stick frames
         self.unknown = 0  #: number of frames that do not answer any request
@@ -72,7 +72,7 @@ class MspSession(VehicleSession):
         self._questions = Questions()
         self._identification: Identification | None = None
         self._telemetry: Telemetry | None = None
-        self._known = False  # whether identification has been completed since it was found
+        self._known = False  # whether identification has been completed since the flight controller was found
         self._refused_variant = ""
         self._unread = ""  # settings that were not reported
         self._part = Setup()  # the settings read so far, which suffice for a stop
@@ -85,9 +85,9 @@ class MspSession(VehicleSession):
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
-        self._wakes_until_ns: int | None = None  # None if its state is unknown; 0 once it has been ready
-        self._woke = False  # whether it was still starting up at the last check
-        self._may_steer = False  # whether its state is known, so that our sticks won't disarm it in flight
+        self._wakes_until_ns: int | None = None  # None if the vehicle's state is unknown; 0 once it has been ready
+        self._woke = False  # whether the flight controller was still starting up at the last check
+        self._may_steer = False  # whether the vehicle's state is known, so that our sticks won't disarm it in flight
         self._armed_throttle: float | None = None
         self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
 
@@ -101,7 +101,7 @@ class MspSession(VehicleSession):
         return applied
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start a take-off; return why that would fail, empty if it may succeed."""
+        """Let the next climb start a take-off; return why that would fail, or an empty text if it may succeed."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         return self.setpoints.ask_takeoff(now_ns)
 
@@ -227,7 +227,7 @@ class MspSession(VehicleSession):
 
     def _publish(self, now_ns: int) -> None:
         if self.setpoints.report.armed is None or self.reported.altitude is None:
-            return  # its state is not known yet
+            return  # the vehicle's state is not known yet
         wakes = self._wakes_up(now_ns)
         if self.link_state is not LinkState.UP or wakes is not self._woke:
             names = ", ".join(self.setpoints.report.hindrances)
@@ -241,7 +241,7 @@ class MspSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def _wakes_up(self, now_ns: int) -> bool:
-        """Return whether it was found recently and only temporary conditions prevent arming."""
+        """Return whether the flight controller was found recently and only temporary conditions prevent arming."""
         report = self.setpoints.report
         if self._wakes_until_ns is None:
             self._wakes_until_ns = now_ns + WAKING_NS
@@ -324,9 +324,9 @@ class MspSession(VehicleSession):
         return made
 
     def _may_stop_unread(self, now_ns: int) -> bool:
-        """Return whether a stop can be sent before all settings are read without arming a vehicle on the ground.
+        """Return whether a stop sent before all settings are read is certain not to arm a vehicle on the ground.
 
-        If the arm switch's range is unknown, its channel is sent low, and with some vehicles a low channel arms.
+        If the arm switch's range is unknown, its channel is sent low, and on some vehicles a low channel arms them.
         """
         if self._refused_variant or self._part.ranges_of(ARM):
             return not self._refused_variant
@@ -338,8 +338,8 @@ class MspSession(VehicleSession):
         """Return whether to withhold sticks, which might wait in a buffer and act late, or override another pilot.
 
         A paused flight controller resumes as if no time had passed and obeys everything that arrived during the pause;
-        only its replies show that it is reading. Until the link is lost, a few frames are sent anyway, to hold off the
-        failsafe if only its replies are lost.
+        only its replies prove that it is reading commands. Until the link is lost, a few frames are sent anyway, to
+        hold off the failsafe in case only the flight controller's replies are lost.
         """
         heard_ns = self._received_ns
         while self._sticks and self._sticks[0] < (heard_ns or 0) and now_ns - self._sticks[0] >= STICKS_LOST_NS:
@@ -436,7 +436,7 @@ class MspSession(VehicleSession):
         self._telemetry = Telemetry(streams, bundle)
 
     def _keep_part(self) -> None:
-        """Keep settings read so far or in an earlier attempt, so that at least a stop is possible."""
+        """Keep the settings read so far or in an earlier attempt, so that at least a stop is possible."""
         if self.setup is not None or self._identification is None:
             return
         found, before = self._identification.setup, self._part
@@ -450,9 +450,9 @@ class MspSession(VehicleSession):
     # Loss ----------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Start identifying it again while polling its state, so that control of a flying vehicle soon resumes.
+        """Identify the flight controller again while polling its state, so control of a flying vehicle soon resumes.
 
-        After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that its own failsafe acts.
+        After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that the vehicle's failsafe acts.
         """
         del now_ns
         self._keep_part()

@@ -32,7 +32,7 @@ NAMED_NS: Final = nanoseconds(0.4)  #: how long a reported obstacle to arming mu
 REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
 ASKED_NS: Final = nanoseconds(1.0)  #: time after which a requested take-off that has not started expires
 ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
-#: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
+#: Temporary conditions after connecting or landing. Arming waits until they clear, with the arm switch off.
 PASSING: Final = frozenset(
     (
         "RXLOSS",
@@ -46,24 +46,24 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     )
 )
-SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: further temporary flags, reported until it has an attitude
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: other temporary flags, reported until the attitude is known
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precision
 LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off
-OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the one at lift-off
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: stall time that counts as a touch-down
+OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the throttle at lift-off
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: duration of a stall that counts as a touchdown
 HEADWAY: Final = 0.4  #: fraction of the requested rate below which a descent counts as stalled
-STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which it is airborne, by precision
+STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which the vehicle is airborne, by precision
 #: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
 #: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but a descent at 0.15 m/s remains visible.
 SMOOTH_S: Final = 0.4
-SINK_PER_S: Final = 0.5  #: throttle reduction while it seems to be on the ground, fraction per second
+SINK_PER_S: Final = 0.5  #: throttle reduction while the vehicle seems to be on the ground, fraction per second
 #: Fraction of the hover throttle below which a vehicle that seems motionless counts as landed, keyed by whether it is
-#: more than HIGH_M above the ground it left. If it is still airborne, it falls at the lower throttle, fast enough to be
-#: noticed even if its motion is measured too slow, as in a simulated world that lags behind the firmware's clock.
+#: more than HIGH_M above the ground it left. A vehicle that is still airborne falls at the lower throttle, fast enough
+#: to be noticed even if its motion is underestimated, as in a simulated world that lags behind the firmware's clock.
 OFF_BELOW: Final = {False: 0.6, True: 0.15}
 HIGH_M: Final = 0.5
-BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown: it sinks
-BLIND_NS: Final = nanoseconds(6.0)  #: time with an unknown climb rate after which it is disarmed
+BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown; the vehicle sinks
+BLIND_NS: Final = nanoseconds(6.0)  #: time with an unknown climb rate after which the vehicle is disarmed
 MOST_LEARNT: Final = 0.9  #: upper limit of the learnt hover throttle
 LEAST_LEARNT: Final = 0.05
 LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
@@ -124,12 +124,12 @@ class SetpointController:
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
-        self._cut = False  # whether its motors were stopped without confirmation, so that it may still be flying
+        self._cut = False  # whether the motors were stopped without confirmation, so the vehicle may still be flying
         self._override = override
         self._setup = Setup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
         self._turn: Curve = self._setup.yaw_curve()
-        self._hindrance = "its settings have not been read"  # why it must not be armed
+        self._hindrance = "its settings have not been read"  # why the vehicle must not be armed
         self._wanted = LEVEL
         self._motion = Motion()
         self._since_ns = 0  # start of the phase
@@ -147,7 +147,7 @@ class SetpointController:
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
-        """Set the flight controller's setup, and the reason why it must not be armed."""
+        """Store the flight controller's setup, and the reason why the vehicle must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
 
@@ -174,7 +174,7 @@ class SetpointController:
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
         """Accept one of the driver's ``ACTIONS``; return the action in force, within the limits.
 
-        Raises :class:`DriverError` if the vehicle is on the ground and can't be armed for this climb, or a reset was
+        Raises :class:`DriverError` if the vehicle is on the ground and can't be armed for this climb, or if a reset was
         requested while the motors were still running.
         """
         if isinstance(action, EmergencyStop):
@@ -208,11 +208,11 @@ class SetpointController:
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
             self._enter(Phase.STANDING, now_ns)  # the take-off is no longer requested, so it must not arm later
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
-            self._start(now_ns)  # takes off only if a take-off was requested, not for any other set-point
+            self._start(now_ns)  # this takes off only if a take-off was requested, not for other set-points
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing is known to prevent it, or if it is already taking off."""
+        """Return why it can't take off now; empty if no reason is known, or if a take-off is already in progress."""
         if self.phase is not Phase.STANDING:
             return ""
         if self.stop.active:
@@ -236,7 +236,7 @@ class SetpointController:
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start a take-off, unless that is certain to fail; return why it would fail."""
+        """Let the next climb start a take-off, unless the take-off is certain to fail; return why it would fail."""
         why = self.why_not(now_ns)
         self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
         return why
@@ -279,7 +279,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                if heard:  # a take-off in progress must not arm it again; after a link loss, there is none
+                if heard:  # a take-off in progress must not arm the vehicle again; after a link loss, there is none
                     self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
@@ -411,7 +411,7 @@ class SetpointController:
             self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
 
     def _lifted(self, climb: float, height: float, step_s: float) -> bool:
-        """Return whether it has left the ground. Precise motion is smoothed so that noise is not taken for one."""
+        """Return whether it has lifted off. Precise motion is smoothed so that noise is not mistaken for a lift-off."""
         if self._motion.precise:
             self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
             self._smooth_height = height = _smoothed(self._smooth_height, height, step_s)
@@ -448,7 +448,7 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
 
     def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
-        """Return whether a descent has reached the ground; reduce the throttle while it seems to have."""
+        """Return whether a descent has reached the ground; reduce the throttle while this seems to be the case."""
         still = STILL[self._motion.precise]
         self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
         self._smooth_wanted = _smoothed(self._smooth_wanted, self._wanted.climb, step_s)

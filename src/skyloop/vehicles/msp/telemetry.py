@@ -45,7 +45,7 @@ class Asked:
 
 
 class Questions:
-    """Asks one question at a time, repeating each until it is answered, up to :data:`TRIES` times in total."""
+    """Asks one question at a time, and repeats it until it is answered, at most :data:`TRIES` times in total."""
 
     def __init__(self) -> None:
         self._queue: deque[tuple[Frame, Handler]] = deque()
@@ -75,7 +75,7 @@ class Questions:
         return self._queue[0][0]
 
     def on_frame(self, frame: Frame) -> bool:
-        """Handle a frame; return whether it is the reply to the current question."""
+        """Handle a frame; return whether the frame is the reply to the current question."""
         if not self._queue or self._sent_ns is None or frame.function != self._queue[0][0].function:
             return False
         self._answer(None if frame.direction is Direction.ERROR else frame.payload)
@@ -106,9 +106,9 @@ class Telemetry:
     """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
-    in its buffers and delay the sticks behind them, so at most ``most`` are unanswered. A reply to ``MULTIPLE``, which
-    newer firmware supports, does not say what it contains, so there is only one ``bundle``, requested at the rate of
-    its first function: if a reply is lost, the next one can't be mistaken for it.
+    in its buffers and delay the sticks behind them, so at most ``most`` requests may be unanswered. A reply to
+    ``MULTIPLE``, which newer firmware supports, does not identify its contents. There is therefore only one ``bundle``,
+    requested at the rate of its first function, so that no reply can be mistaken for a lost one.
     """
 
     def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:
@@ -132,7 +132,7 @@ class Telemetry:
         self._asked.clear()
 
     def due_ns(self) -> int | None:
-        """Return when the next request is due; None if none ever is."""
+        """Return when the next request is due; None if no request will ever be due."""
         return min((stream.due_ns for stream in self._streams), default=None)
 
     def requests(self, now_ns: int) -> list[Frame]:
@@ -151,7 +151,7 @@ class Telemetry:
         return made
 
     def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
-        """Handle a frame; return the states that it contains, with None for one that the firmware does not support."""
+        """Handle a frame; return the states that it contains, using None for any that the firmware does not support."""
         for number, asked in enumerate(self._asked):
             if frame.function != asked.function:
                 continue
@@ -166,12 +166,12 @@ class Telemetry:
 
 Vector = tuple[float, float, float]
 
-POSE_NS: Final = nanoseconds(0.25)  #: maximum age of a pose that is used
-ALTITUDE_NS: Final = nanoseconds(0.5)  #: maximum age of a barometer altitude that is used
-GPS_NS: Final = nanoseconds(1.0)  #: maximum age of a GPS fix that is used
+POSE_NS: Final = nanoseconds(0.25)  #: poses older than this are ignored
+ALTITUDE_NS: Final = nanoseconds(0.5)  #: barometer altitudes older than this are ignored
+GPS_NS: Final = nanoseconds(1.0)  #: GPS fixes older than this are ignored
 GAP_NS: Final = nanoseconds(0.4)  #: gap between poses above which the velocity filter restarts
 SMOOTH_S: Final = 0.05  #: time constant of the velocity computed from poses
-LEAST_SATELLITES: Final = 5  #: minimum number of satellites of a fix that is used
+LEAST_SATELLITES: Final = 5  #: fixes with fewer satellites than this are ignored
 GROUND_SAMPLES: Final = 10  #: approximate number of samples over which the ground's height is averaged
 EARTH_RADIUS_M: Final = 6_371_000.0
 
@@ -185,7 +185,7 @@ class VelocityFilter:
         self._at_ns: int | None = None
 
     def update(self, place: Vector, at_ns: int) -> None:
-        """Add a position [m] measured at a time [ns]; ignore one that is not newer."""
+        """Add a position [m] measured at a time [ns]; ignore a position that is not newer than the last one."""
         gap_ns = None if self._at_ns is None else at_ns - self._at_ns
         if gap_ns is not None and gap_ns <= 0:
             return
@@ -207,7 +207,7 @@ class Motion:
     """The present motion, with None for unknown values. World axes are east, north, up."""
 
     climb_m_s: float | None = None
-    height_m: float | None = None  #: height above the place where it was last on the ground
+    height_m: float | None = None  #: height above the place where the vehicle was last on the ground
     velocity_m_s: Vector | None = None  #: velocity in world axes
     position_m: Vector | None = None
     yaw_rad: float | None = None
@@ -225,7 +225,7 @@ class MotionEstimate:
         self._origin: Gps | None = None
         self._heading_rad: float | None = None  # heading as a yaw angle, counter-clockwise from east
         self._turned_rad: float | None = None  # difference between the poses' yaw and this heading
-        self._ground: dict[str, float] = {}  # height from each source where it was last on the ground
+        self._ground: dict[str, float] = {}  # height reported by each source where the vehicle was last on the ground
         self._stood = 0  # number of samples of the ground's height
         self.satellites: int | None = None
 
@@ -263,7 +263,7 @@ class MotionEstimate:
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the ground's height while at rest; one sample's error may exceed the height of a lift-off."""
+        """Learn the ground's height while at rest; the error of a single sample may exceed the height of a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])

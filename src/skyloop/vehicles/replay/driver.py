@@ -24,7 +24,7 @@ _CLOSE_S: Final = 2.0  #: time allowed for the thread to end
 
 
 class ReplayDriver(Driver):
-    """A vehicle that replays a recording: it accepts every command but follows none.
+    """A vehicle that replays a recording: it accepts every command but follows no command.
 
     With ``speed=max`` nothing plays automatically. The consumer sets :attr:`clock` before :meth:`open`, then advances
     the replay through :attr:`steps`.
@@ -45,7 +45,7 @@ class ReplayDriver(Driver):
         self._publisher: ReplayPublisher | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the recording's cameras. The file is read once; :meth:`open` refuses an unreadable one."""
+        """Return the recording's cameras. The file is read once; :meth:`open` refuses an unreadable file."""
         if self._capabilities is None:
             try:
                 recording, drone = self._read()

@@ -1,6 +1,6 @@
 """Players for recordings: on a thread in real time, or sample by sample for a caller that advances the time.
 
-The vehicle's samples are published unchanged; those of the recorded proxy become messages about the past. Viewers set
+The vehicle's samples are published unchanged; the recorded proxy's samples become messages about the past. Viewers set
 position, speed and pause through parameters.
 """
 
@@ -64,7 +64,7 @@ class Playback:
         self.duration_s = duration_s
         self.position_s = 0.0  #: position in the recording, set by the player
         self.over = False  #: whether the end has been reached, set by the player
-        self.jumps = 0  #: number of changes in position other than by playing
+        self.jumps = 0  #: number of position changes not caused by playing
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -156,7 +156,7 @@ class Playback:
         """Return what the player should do now; each position is returned only once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
-            if wanted.position_s is not None:  # the client that wrote it may read it back before that moment is shown
+            if wanted.position_s is not None:  # clients may read it back before that moment is shown
                 self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()
@@ -175,7 +175,7 @@ class Playback:
 
 # Publishing ----------------------------------------------------------------------------------------------------------
 
-#: Events from the vehicle itself. All others came from the recorded proxy or an application, and clients must not
+#: Events from the vehicle itself. All other events came from the recorded proxy or an application, and clients must not
 #: mistake them for events about their own authority or commands.
 _VEHICLES_OWN: Final = frozenset({EventKind.COLLISION, EventKind.VEHICLE_MESSAGE, EventKind.DRIVER_ERROR})
 #: Events that the replay's own proxy emits itself.
@@ -232,8 +232,8 @@ class ReplayPublisher:
     def still(self, moment: Moment) -> Callable[[], None]:
         """Return a function that publishes a moment's state and images with a common capture time.
 
-        It may be called repeatedly while the replay is paused; each image is decoded only once. The moment's command
-        and parameters become the current ones.
+        The function may be called repeatedly while the replay is paused; each image is decoded only once. The moment's
+        command and parameters become the current ones.
         """
         self._command = {} if moment.command is None else described(moment.command)
         for parameter in moment.parameters:
@@ -254,7 +254,7 @@ class ReplayPublisher:
         return publish
 
     def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
-        """Publish the vehicle's part with this position, otherwise unchanged, and the proxy's as native telemetry."""
+        """Publish the vehicle's feedback with this position, and the proxy's feedback as native telemetry."""
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
         playback = self._playback
@@ -339,7 +339,7 @@ def described(applied: Applied) -> dict[str, Value]:
 
 
 def numbers(action: AnyAction) -> tuple[float, ...]:
-    """Return an action's numbers in field order, with NaN for a missing one such as a position's yaw."""
+    """Return an action's numbers in field order, with NaN for a missing number such as a position's yaw."""
     given = (getattr(action, name) for name in action.__struct_fields__)
     return tuple(math.nan if number is None else float(number) for number in given)
 
@@ -381,7 +381,7 @@ class Player:
         self._damaged = 0  # number of damaged frames in earlier passes
 
     def run(self, wait_for: tuple[str, ...]) -> None:
-        """Play until stopped, starting once a client wants one of these cameras, or at once if none are given.
+        """Play until stopped, starting once a client wants one of these cameras, or at once if no cameras are given.
 
         At the end the link goes down; it comes up again if a viewer seeks back.
         """
@@ -518,7 +518,7 @@ class StepPlayer:
         self._next = next(self._samples, None)
 
     def step(self) -> None:
-        """Publish the next sample, whose time has come. After the last sample, close the link."""
+        """Publish the next sample, which is now due. After the last sample, close the link."""
         sample = self._next
         if sample is None:
             raise UsageError("the recording is over")

@@ -37,7 +37,7 @@ class Moment:
     """A drone's state at a given time in its recording, and the samples that follow."""
 
     at_ns: int
-    state: Feedback | None = None  #: state when the images were captured, or the newest one if there are no images
+    state: Feedback | None = None  #: state when the images were captured, or the newest state if there are no images
     pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
     parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before the moment
@@ -49,8 +49,8 @@ class Moment:
         return self.state is not None and found.issuperset(cameras)
 
 
-#: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
-#: has an image. A camera with no image in them shows nothing.
+#: Numbers of parts of the file (about half a second each) to read before the time sought. They are tried in turn until
+#: each camera has an image. A camera that has no image in any of these parts stays blank.
 _PARTS_BEFORE: Final = (1, 4, 16)
 _KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
 
@@ -127,7 +127,7 @@ class ReplaySource:
 
     def _timed(self, log_ns: int) -> Iterator[TimedSample]:
         """Yield the samples received at the given log time or later."""
-        resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found on the way
+        resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found along the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
         course = Course(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
@@ -204,8 +204,8 @@ def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> 
 def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
     """Return the capabilities of a replay.
 
-    Its cameras are those with recorded frames. It accepts every command if the recorded vehicle accepted any,
-    natively or through the software autopilot.
+    The vehicle's cameras are those with recorded frames. A replay accepts every command if the recorded vehicle
+    accepted any, natively or through the software autopilot.
     """
     was = drone.described
     known = {camera.name: camera for camera in was.cameras}
@@ -246,7 +246,7 @@ class Timeline:
     """Converts between the recording's clock and the replay's. Pure."""
 
     def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
-        """Make ``begin_ns`` on the recording's clock correspond to ``origin_ns`` on the replay's."""
+        """Make ``begin_ns`` on the recording's clock correspond to ``origin_ns`` on the replay's clock."""
         self._speed = speed
         self._begin_ns = begin_ns
         self._origin_ns = origin_ns

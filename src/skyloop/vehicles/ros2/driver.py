@@ -22,8 +22,8 @@ _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.s
 class Ros2Driver(Driver):
     """Any ROS 2 robot with images and ``cmd_vel``. See ``docs/ros.md`` for its options.
 
-    It supports velocities, and also take-off and landing if the address names the robot's services for them. If the
-    robot's odometry reports its height, the proxy builds the missing actions from velocities.
+    The driver supports velocities, and also take-off and landing if the address names the robot's services for them. If
+    the robot's odometry reports its height, the proxy builds the missing actions from velocities.
     """
 
     def __init__(self, uri: VehicleUri) -> None:
@@ -64,7 +64,7 @@ PURPOSE: Final = "a robot of ROS 2"
 class RobotLink:
     """A node that subscribes to a robot's topics and publishes ``cmd_vel`` for it.
 
-    It subscribes to images only while an application wants them, or if no other topic shows that the robot is present.
+    The driver subscribes to images only while an application wants them, or if no other topic indicates a robot.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Environment variables that configure discovery; if one of them is set, discovery is left as configured.
+#: Environment variables that configure discovery; if any of them is set, discovery is left as configured.
 DISCOVERY_VARIABLES: Final = (
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -26,14 +26,14 @@ DISCOVERY_VARIABLES: Final = (
     "ROS_LOCALHOST_ONLY",
     "ROS_DISCOVERY_SERVER",
 )
-#: Variables with a profile's path, for Fast DDS 3 and for Fast DDS 2 (Jazzy and earlier).
+#: Environment variables for the path of a profile, for Fast DDS 3 and for Fast DDS 2 (Jazzy and earlier).
 PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
 _OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
 _FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS 3
 MOST_DOMAIN: Final = 101  #: maximum domain: above it, outgoing connections on Linux may occupy DDS's ports
 SHARED_BYTES: Final = 16 * 2**20  #: shared memory per participant: several images; the default 512 KiB is too small
 
-#: A profile for Fast DDS: sockets only on loopback, and shared memory with room for images.
+#: A profile for Fast DDS: sockets only on loopback, and shared memory large enough for images.
 LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com">
   <profiles>
@@ -64,7 +64,7 @@ LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 
 
 def require_rclpy(purpose: str, *packages: str) -> Any:
-    """Import rclpy and message packages; return rclpy. If one is missing, the error states the purpose."""
+    """Import rclpy and message packages; return rclpy. If a package is missing, the error states the purpose."""
     from importlib import import_module
 
     try:
@@ -78,7 +78,7 @@ def require_rclpy(purpose: str, *packages: str) -> Any:
 def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
     """Make this process's nodes visible only on this machine, unless the environment configures discovery.
 
-    Call this before creating the first node. Returns whether it changed the environment. The profile is a file in a
+    Call this before creating the first node. Returns whether the environment was changed. The profile is a file in a
     temporary directory that is removed at exit.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
@@ -106,7 +106,7 @@ def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
 
 
 def domain_of(text: str | None) -> int | None:
-    """Parse a domain; None if there is no text, in which case ROS 2 uses ``ROS_DOMAIN_ID``."""
+    """Parse a domain; return None if there is no text, in which case ROS 2 uses ``ROS_DOMAIN_ID``."""
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):

@@ -31,7 +31,7 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Full names of a robot's topics and services, empty for those that it lacks, and the other options."""
+    """Full names of a robot's topics and services (empty if the robot lacks them), and the other options."""
 
     namespace: str  #: namespace with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
@@ -48,12 +48,12 @@ class Options:
     fps: float  #: frame rate [1/s]
     compressed: bool  #: whether images are JPEG
     stamped: bool  #: whether velocities have a stamp
-    ground: bool  #: whether it is a ground vehicle, for which take-off and landing start and end the drive
+    ground: bool  #: whether the robot is a ground vehicle, for which take-off and landing start and end the drive
     timeout_s: float  #: time without data after which the link counts as lost [s]
     domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
-        """Return the capabilities that follow from the robot's topics and services."""
+        """Return the capabilities provided by the robot's topics and services."""
         actions: set[str] = set()
         if self.cmd_vel:
             actions = {"idle", "velocity"}

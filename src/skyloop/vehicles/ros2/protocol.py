@@ -181,7 +181,7 @@ class RobotSession:
             if blind:
                 self._fields = {}
             if (blind or lost) and self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
-                self._velocity = Velocity()  # its motion is unknown without odometry
+                self._velocity = Velocity()  # the robot's motion is unknown without odometry
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
@@ -263,13 +263,13 @@ class RobotSession:
         self._velocity, self._pending = None, pending
 
     def _fail_pending(self) -> None:
-        """Drop the pending action, and stop after a landing: without a watchdog, a robot keeps its last velocity."""
+        """Drop the pending action, and stop the robot after a landing: without a watchdog, it keeps its velocity."""
         if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
             self._velocity = Velocity()
         self._pending = None
 
     def _received(self) -> int:
-        """Record the arrival of a message and return the time."""
+        """Record the arrival of a message and return its time."""
         self._received_ns = now_ns = self._clock()
         if self._link is not LinkState.UP and not self._is_blind(now_ns):
             self._find(now_ns)
@@ -280,7 +280,7 @@ class RobotSession:
         return self._odometry_ns is not None and seconds(now_ns - self._odometry_ns) > self._options.timeout_s
 
     def _find(self, now_ns: int) -> None:
-        """Report the robot as found, once its services have been found too or have been missing for too long."""
+        """Report the robot as found once its services have been found too, or have been missing for too long."""
         missing = self._robot.missing()
         if not missing:
             self._link = LinkState.UP
@@ -330,14 +330,14 @@ def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
     return data, size
 
 
-PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: age above which a stamp is from another clock, as are future stamps
+PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp older than this is from another clock, as is a stamp in the future
 
 
 class CaptureClock:
     """Converts one topic's stamps to this host's monotonic clock.
 
-    A stamp slightly older than the system clock's time belongs to that clock. Other stamps come from a simulation or
-    an unset clock; for them the smallest recent delay counts as zero. Times never go backwards.
+    A stamp slightly older than the system clock's time is assumed to come from that clock. Other stamps come from a
+    simulation or an unset clock; for them the smallest recent delay counts as zero. Times never go backwards.
     """
 
     def __init__(self) -> None:

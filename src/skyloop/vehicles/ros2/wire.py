@@ -1,8 +1,8 @@
 """Conversions between the values in ROS 2 messages and Skyloop's. Pure.
 
 Both use the same axes (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical axes x
-right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's is in body
-axes; ROS 2 expresses angles as quaternions, and marks unknown values with a covariance of -1 or with NaN.
+right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's velocity is in
+body axes; ROS 2 expresses angles as quaternions, and marks unknown values with a covariance of -1 or with NaN.
 
 A ``tf2_msgs/msg/TFMessage`` is built as bytes, because its package can be installed only with a ROS 2 distribution. The
 format is OMG's Common Data Representation, version 1, little-endian, as in DDS: a four-byte header, then the fields in
@@ -60,8 +60,8 @@ def nanoseconds_of(stamp: Any) -> int:
 class ClockMap:
     """Converts times on a proxy's monotonic clock to ROS time.
 
-    The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that the intervals between
-    stamps equal those between captures. A larger error means that a clock was set, or that ROS time is simulated.
+    The offset between the clocks is kept until its error exceeds ``tolerance_s``, so that the intervals between stamps
+    equal the intervals between captures. A larger error means that a clock was set, or that ROS time is simulated.
     """
 
     def __init__(self, tolerance_s: float = 1e-3) -> None:
@@ -83,7 +83,7 @@ class ClockMap:
 
 
 def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
-    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or is almost zero."""
+    """Return the matrix of a quaternion, shape (3, 3); None if the quaternion is not finite or is almost zero."""
     length = math.sqrt(sum(each * each for each in quaternion))
     if not (math.isfinite(length) and length > 1e-6):
         return None
@@ -98,7 +98,7 @@ def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
 
 
 def euler_of(quaternion: Quaternion) -> tuple[float, float, float] | None:
-    """Return roll, pitch and yaw of a quaternion [rad]; None if it is invalid."""
+    """Return roll, pitch and yaw of a quaternion [rad]; None if the quaternion is invalid."""
     rotation = rotation_of(quaternion)
     return None if rotation is None else euler_from_rotation(rotation)
 
@@ -215,7 +215,7 @@ def skew_of(info: Any) -> float:
 
 
 #: Encodings that OpenCV converts to BGR: rows per pixel of height, bytes per pixel of width, and OpenCV's name. ROS
-#: names a Bayer pattern after the first two pixels of a row, OpenCV after the second and third of the second row.
+#: names a Bayer pattern after a row's first two pixels, OpenCV after pixels 2 and 3 of the second row.
 _CONVERTED: Final[dict[str, tuple[float, int, str]]] = {
     "yuv422": (1, 2, "YUV2BGR_UYVY"),
     "uyvy": (1, 2, "YUV2BGR_UYVY"),

@@ -1,1 +1,1 @@
-"""``sim://`` addresses: simulated drones, each in a separate world or sharing one on a host."""
+"""``sim://`` addresses: simulated drones, each in a separate world or sharing a world on a host."""

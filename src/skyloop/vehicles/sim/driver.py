@@ -60,7 +60,7 @@ class SimDriver(Driver):
     axes. ``sim.time_s`` is the simulation's own time.
 
     With ``autopilot`` in the address, real firmware flies the drone. Capabilities, feedback and most parameters are
-    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else is as for any simulated drone.
+    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else works as for any simulated drone.
     See ``docs/autopilots.md``.
 
     Args:
@@ -155,7 +155,7 @@ class SimDriver(Driver):
         return self._apply(action) if self._firmware is None else self._firmware.apply(action, new=False)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse actions that the firmware would refuse; the built-in autopilot refuses none."""
+        """Refuse actions that the firmware would refuse; the built-in autopilot refuses no actions."""
         if self._firmware is not None:
             self._firmware.driver.check(action)
 
@@ -168,7 +168,7 @@ class SimDriver(Driver):
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Pass a pose to the firmware; the built-in autopilot accepts none."""
+        """Pass a pose to the firmware; the built-in autopilot does not accept poses."""
         if self._firmware is None:
             super().external_pose(pose)
         else:
@@ -242,7 +242,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio on or off. Like a real drone, it holds its position without reception."""
+        """Switch the simulated radio on or off. Like a real drone, it holds its position while it receives nothing."""
         sink = self._sink
         if sink is None:
             return
@@ -311,7 +311,7 @@ DOWN_M: Final = 0.08  #: height below which a descending drone counts as landed
 
 
 class SetpointController:
-    """Starts the motors for a set-point that climbs, and stops them on the ground for one that descends.
+    """Starts the motors for a climbing set-point, and stops them on the ground for a descending set-point.
 
     The simulated firmware accepts set-points only in the air, so its own take-off to the lowest height comes first.
     """

@@ -47,8 +47,8 @@ _NAMES: Final = {
 _ERRORS: Final = (FirmwareEventKind.SILENT, FirmwareEventKind.DIED, FirmwareEventKind.FAILED)
 _KEPT_REPORTS: Final = 64  # number of reports kept, to find the truth at the time of delayed feedback
 _POSE_STD_M: Final = 0.001  # standard deviation reported for the true position
-#: Maximum age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
-#: time, so is the firmware's clock; its driver trusts that clock and would report a greater age.
+#: Maximum age of the firmware's reported state, which arrives over loopback. If the simulation runs slower than real
+#: time, so does the firmware's clock; the driver trusts that clock and would report a greater age.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
@@ -68,7 +68,7 @@ class FirmwareFlight:
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
-        self._found = False  # whether its driver has received data since the start
+        self._found = False  # whether the driver has received data since the start
         self._linked = False  # whether the firmware's driver should be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 
@@ -100,7 +100,7 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver is opened once the process is running."""
+        """Start the firmware and let it fly the drone; the firmware's driver is opened once the process is running."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:
@@ -178,7 +178,7 @@ class FirmwareFlight:
     # Flying ----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, *, new: bool) -> AnyAction:
-        """Pass an action to the firmware's driver; it is lost if there is no link."""
+        """Pass an action to the firmware's driver; the action is lost if there is no link."""
         inner = self._inner
         return action if inner is None else inner.apply(action, new=new)
 
@@ -192,7 +192,7 @@ class FirmwareFlight:
     # Called by the host and by the inner driver ----------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Store the truth for later feedback, and pass it to a vehicle that needs an external position."""
+        """Store the true state for later feedback, and pass it to a vehicle that needs an external position."""
         self._reports.append(report)
         inner = self._inner
         if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:
@@ -204,7 +204,7 @@ class FirmwareFlight:
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback with the true state at the same time, if already known."""
+        """Return the firmware's feedback, with the true state at the same time if that is known already."""
         reports = tuple(self._reports)
         if not reports:
             return feedback

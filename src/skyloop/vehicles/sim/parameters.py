@@ -74,7 +74,7 @@ def geometry(world: World) -> Parameter:
 
 
 def with_value(state: ParameterValues, name: str, value: Value) -> tuple[ParameterValues, Value]:
-    """Return the values after writing one of them, and that value as written; raise if the name or value is invalid."""
+    """Return the values after writing one of them, and the written value; raise if the name or value is invalid."""
     group = _GROUPS.get(name.partition(".")[0])
     for entry in group(state, state) if group is not None else ():
         if entry.parameter.name == name:

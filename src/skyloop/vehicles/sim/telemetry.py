@@ -16,7 +16,7 @@ from skyloop.sim.world import Vec3
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
     """Convert a report to feedback; the options select whether it includes position, velocity and truth.
 
-    ``state`` is the flight state to report, which is less detailed for a vehicle that flies by set-points alone.
+    ``state`` is the flight state to report, which is less detailed for a vehicle that flies only by set-points.
     """
     believed = report.believed
     native = native_of(report, options)

@@ -40,7 +40,7 @@ class TelloDriver(Driver):
     def capabilities(self) -> Capabilities:
         """Return the drone's capabilities.
 
-        They include the downward camera, although only SDK 3.0 can switch to it.
+        The cameras include the downward one, although only SDK 3.0 can switch to it.
         """
         return Capabilities(
             vehicle="tello",
@@ -95,7 +95,7 @@ class TelloDriver(Driver):
             return link.session.diagnose()
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters. Those that depend on the SDK version appear once that is known."""
+        """Return the parameters. Parameters that depend on the SDK version appear once the version is known."""
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:

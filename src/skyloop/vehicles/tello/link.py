@@ -15,7 +15,7 @@ from skyloop.messages import AnyAction
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 
-_BUFFER: Final = 1 << 20  # size that holds half a second of video
+_BUFFER: Final = 1 << 20  # buffer size, enough for half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:

@@ -1,6 +1,6 @@
 """The driver's and the drone's settings as parameters, and how to write them.
 
-The drone's settings can't be queried, so the last written value is shown, and sent again after a link loss.
+The drone's settings can't be queried, so the driver returns the last written value, and resends it after a link loss.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
 
 
 class DroneSettings:
-    """Holds the values of all parameters. The drone's own are written through the link."""
+    """Holds the values of all parameters. The drone's own settings are written through the link."""
 
     def __init__(self, link: TelloLink) -> None:
         self._link = link

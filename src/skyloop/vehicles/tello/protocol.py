@@ -39,8 +39,8 @@ class Request:
 
     text: str
     done: Done  #: called with the reply, or None if there was none
-    tries: int = TRIES  #: maximum number of times to send it
-    sent_ns: int | None = None  #: when it was last sent
+    tries: int = TRIES  #: maximum number of times to send the command
+    sent_ns: int | None = None  #: when the command was last sent
 
 
 class Conversation:
@@ -124,14 +124,14 @@ class Conversation:
 
 TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
-DEGRADED_NS: Final = nanoseconds(0.6)  #: time without state after which the link is DEGRADED; it arrives at 10 Hz
+DEGRADED_NS: Final = nanoseconds(0.6)  #: time without state after which the link is DEGRADED; state arrives at 10 Hz
 LOST_NS: Final = nanoseconds(1.5)  #: time without state after which the link is LOST
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
-ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without commands lands; it begins to after 15 s
+ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without commands has landed; landing begins after 15 s
 ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
-DEAF: Final = 2  #: number of consecutive unanswered requests that means our commands are not received
+DEAF: Final = 2  #: this many consecutive unanswered requests mean that our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
 ALIVE: Final = "wifi?"
 DEFAULT_HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
@@ -143,8 +143,8 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 class TelloSession(VehicleSession):
     """The protocol between an open driver and its drone. Not thread-safe.
 
-    ``extra`` returns further telemetry for ``Feedback.native``, and ``video_ns`` the time when usable video or a key
-    frame last arrived (0 if never).
+    ``extra`` returns further telemetry for ``Feedback.native``. ``video_ns`` returns the time when usable video or a
+    key frame last arrived (0 if never).
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
@@ -324,7 +324,7 @@ class TelloSession(VehicleSession):
         return self.setpoints.flies_unheard
 
     def _keep_alive(self, now_ns: int) -> None:
-        """Send a periodic request, which keeps the drone awake and shows whether it receives our commands."""
+        """Send a periodic request, which keeps the drone awake and reveals whether it receives our commands."""
         if self._is_silent(now_ns):
             return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
@@ -335,7 +335,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
-        """Return whether to withhold requests, because each delays the automatic landing of a drone without a pilot."""
+        """Return whether to withhold requests, because each one delays the automatic landing of a pilotless drone."""
         asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
         return asked and self.setpoints.flown_by_others
 
@@ -408,4 +408,4 @@ class TelloSession(VehicleSession):
 
 
 def _ignore_reply(_reply: str | None) -> None:
-    """Ignore the reply, because the drone's state or video shows the effect of the command."""
+    """Stop waiting for the reply, because the drone's state or video already shows that the command took effect."""

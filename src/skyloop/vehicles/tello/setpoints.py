@@ -1,6 +1,6 @@
-"""Convert set-points to sticks and motions. The last action is kept until the state shows that it is done. Pure.
+"""Convert set-points to sticks and motions. The last action is kept until the state confirms that it is complete. Pure.
 
-Replies may arrive seconds late or never, so it repeats a take-off or landing until it takes effect.
+Replies may arrive seconds late or never, so a take-off or landing is repeated until it takes effect.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state is arriving
-        #: Set after an abandoned stop or landing until the next command: we send nothing, so it lands after 15 s.
+        #: Set after an abandoned stop or landing until the next command: we send nothing; the drone lands after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
@@ -118,7 +118,7 @@ class SetpointController:
         self._sent_ns: int | None = None  # when the take-off or landing was sent
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
         self._state_ns = 0  # when the last state arrived
-        self._was_in_air = False  # whether the last state said so, or we have just sent a take-off
+        self._was_in_air = False  # whether the last state was in the air, or we have just sent a take-off
         self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
         self._events: list[VehicleEvent] = []
 
@@ -142,7 +142,7 @@ class SetpointController:
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return FlightState.LANDING  # it may be about to rise
+            return FlightState.LANDING  # the drone may be about to rise
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
         return self.watch.phase
@@ -233,7 +233,7 @@ class SetpointController:
         return True
 
     def forget_flight(self) -> None:
-        """Assume that the drone has landed: without contact or commands, it had time to land automatically."""
+        """Assume that the drone has landed: without contact or commands, it has had time to land automatically."""
         self._was_in_air = self._steering = False
 
     # Receiving ----------------------------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ class SetpointController:
         phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
-        if rose and phase is FlightState.LANDED:  # it fell over or was stopped: don't start it again
+        if rose and phase is FlightState.LANDED:  # the drone fell over or was stopped: don't start it again
             self._decide(Decision.STAY, now_ns)
             text = "the drone began to take off, and its motors stopped: it is not started again"
             self._events.append(message(text, "no_takeoff", Severity.WARNING))
@@ -265,7 +265,7 @@ class SetpointController:
             self._events.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
 
     def lost(self, now_ns: int) -> None:
-        """Cancel a take-off and level the sticks after a link loss. A landing is still sent."""
+        """Cancel a take-off and level the sticks after a link loss. A landing command is still sent."""
         self.receiving = False
         self._was_in_air |= now_ns < self._rises_until_ns
         if self._decision is Decision.TAKE_OFF:
@@ -281,7 +281,7 @@ class SetpointController:
         return events
 
     def motions(self, now_ns: int) -> list[str]:
-        """Return the motions to send now, whose replies take seconds."""
+        """Return the motions to send now; their replies take seconds."""
         if self.stop.active:
             return [EMERGENCY] if self.stop.step(self._motors_are_off(now_ns), now_ns) else []
         if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
@@ -303,7 +303,7 @@ class SetpointController:
     def stick(self) -> Stick | None:
         """Return the stick values for ``rc``, or None to send none.
 
-        This is the case if the drone is on the ground, taking off, landing, or flown by another program.
+        None is returned if the drone is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

@@ -1,8 +1,8 @@
 """Convert state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
 
 No field in the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` increases by one every
-second only while the motors run, and the distance sensor shows whether the ground is near. Our own commands serve only
-to interpret the observations: a climb after a take-off command is a take-off.
+second only while the motors run, and the distance sensor detects whether the ground is near. Our own commands serve
+only to interpret the observations: a climb after a take-off command is a take-off.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 
 
 def height_m(state: State) -> float | None:
-    """Return the measured height above the surface below [m] or, if there is none, that above the take-off point.
+    """Return the height [m]: as measured above the surface below or, without a measurement, above the take-off point.
 
     The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells them apart.
     """
@@ -55,7 +55,7 @@ def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
 def feedback_of(
     state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
 ) -> Feedback:
-    """Return the drone's state in SI units and our axes. Values that it does not report are None."""
+    """Return the drone's state in SI units and our axes. Values that the drone does not report are None."""
     acceleration = state.acceleration_mg
     factor = STANDARD_GRAVITY / 1000
     return Feedback(
@@ -91,7 +91,7 @@ LOW_M: Final = 0.15  #: maximum height that counts as near the ground
 HIGH_M: Final = 0.25  #: minimum height that counts as off the ground
 HOVER_M: Final = 0.4  #: minimum height at the end of a take-off
 SLOW_DM_S: Final = 1.0  #: maximum vertical speed at the end of a take-off
-SETTLED: Final = 3  #: number of consecutive high and slow samples that end a take-off
+SETTLED: Final = 3  #: number of consecutive samples within both limits that end a take-off
 RISE_NS: Final = nanoseconds(8.0)  #: maximum duration of a take-off
 
 _S = FlightState
@@ -100,8 +100,8 @@ _S = FlightState
 class FlightWatch:
     """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
 
-    ``rising`` and ``sinking`` mean that a take-off or landing was requested and is not complete, ``landing_answered``
-    that the drone has replied that it landed.
+    ``rising`` and ``sinking`` mean that a take-off or landing was requested and is not complete; ``landing_answered``
+    means that the drone has replied that it landed.
     """
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class FlightWatch:
         return _S.HOVERING
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
-        """Return whether a landed drone has taken off. Being carried around does not count."""
+        """Return whether a landed drone has taken off. Carrying the drone around does not count as a take-off."""
         begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before the landing
         if self.rising and (high or (motors and begun)):
             return True
@@ -174,9 +174,9 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: estimated limit: users report that the drone refuses to start its motors somewhat above this
+HOT_C: Final = 90.0  #: estimated limit: users report that the drone does not start its motors when somewhat hotter
 COOL_C: Final = 85.0  #: temperature below which a hot drone no longer counts as hot
-PAD_LOST: Final = 5  #: number of consecutive states without a pad after which it counts as out of view
+PAD_LOST: Final = 5  #: number of consecutive states without a pad after which the pad counts as out of view
 
 
 class Health:
@@ -193,7 +193,7 @@ class Health:
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return a finding if the drone is too hot to fly; none while its temperature is unknown."""
+        """Return a finding if the drone is too hot to fly; no finding while its temperature is unknown."""
         if self._celsius is None:
             return []
         if not self._hot:

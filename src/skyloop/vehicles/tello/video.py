@@ -53,7 +53,7 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras. The drone sends one at a time; the downward one needs SDK 3.0.
+    """Return both cameras. The drone sends the images of one camera at a time; the downward camera needs SDK 3.0.
 
     Intrinsics in the address apply to the front camera.
     """
@@ -124,7 +124,7 @@ class VideoStream:
         self._socket.close()
 
     def _drain(self, frames: list[Coded]) -> None:
-        """Read what has arrived up to the end of an image, so that it is decoded while the next one arrives."""
+        """Read what has arrived up to the end of an image, so that the image is decoded while the next one arrives."""
         for _ in range(BURST):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
@@ -141,7 +141,7 @@ class VideoStream:
 
 # Decoder -------------------------------------------------------------------------------------------------------------
 
-MOST_UNITS: Final = 120  #: maximum number kept for decoding again; the drone's key frames are 30 images apart
+MOST_UNITS: Final = 120  #: maximum number of images kept for decoding again; the drone's key frames are 30 images apart
 _PURPOSE: Final = "the video of a Tello"
 
 

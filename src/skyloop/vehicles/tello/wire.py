@@ -3,7 +3,7 @@
 Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". The additions in SDK 3.0 (Tello Talent, and EDU with
 newer firmware) are known from the commands that djitellopy sends.
 
-A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
+A reply does not identify its command, and may arrive seconds late or twice. A reply is therefore matched to a command
 only if it has the format of that command's replies.
 
 State arrives ten times per second; unknown values are None. Axes follow aviation: x forward, y right, z down;
@@ -11,8 +11,8 @@ positive pitch is nose up, positive roll right side down, positive yaw clockwise
 attitude and acceleration: a Tello that reports a pitch of 8° reports 0.116 g along x.
 
 Video is H.264 in Annex B form, divided into pieces of 1460 bytes without headers or numbers. A piece shorter than the
-others ends an image, and one that begins with a start code begins the next. If a piece is lost in the middle of an
-image, only the decoder notices.
+others ends an image, and a piece that begins with a start code begins the next image. If a piece is lost in the middle
+of an image, only the decoder notices.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SILENCE_S: Final = 15.0  #: time without a command after which the Tello lands
 
 ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100
-#: Effect of a stick at 100; an estimate, because no guide gives it. Users take ``rc`` to be in cm/s and degrees/s.
+#: Effect of a stick at 100; an estimate, because no guide gives it. Users assume that ``rc`` is in cm/s and degrees/s.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
@@ -49,13 +49,13 @@ class Sdk(StrEnum):
     V3_0 = "3.0"
 
     def knows(self, other: Sdk) -> bool:
-        """Return whether this version is the same as the other one or newer."""
+        """Return whether this version is the other version or a newer one."""
         return self.value >= other.value
 
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """Values of ``rc``, from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
+    """Values of ``rc``, from -100 to 100. Positive values mean right, forward, up, and clockwise seen from above."""
 
     right: int = 0
     forward: int = 0
@@ -76,7 +76,7 @@ def ports(state: int, video: int) -> str:
 
 
 def decoded(datagram: bytes) -> str | None:
-    """Return a datagram's text without surrounding white space; None if it is not text as used in this protocol."""
+    """Return a datagram's text without surrounding white space; None if it is not valid text in this protocol."""
     if len(datagram) > MAX_COMMAND:
         return None
     try:
@@ -139,7 +139,7 @@ def answers(reply: str, command: str) -> bool:
 MAX_STATE: Final = 1024
 FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
-GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, which is its minimum
+GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, its minimum
 NO_PAD: Final = -1  #: pad number while none is in view (-2 if detection is off)
 NOWHERE_CM: Final = -100  #: value of each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
@@ -235,7 +235,7 @@ PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 or 0 if none is in view; some firmware then sends 257
+    if number is None or number not in PADS:  # -1 or 0 if no pad is in view; some firmware sends 257 instead
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -248,7 +248,7 @@ def build(fields: list[tuple[str, str]]) -> bytes:
 
 
 PIECE: Final = 1460  #: size of every datagram of an image except the last [bytes]
-MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real ones have a fiftieth of that
+MAX_PICTURE: Final = 1 << 19  #: maximum size of an image [bytes]; real images are a fiftieth of that size
 _SLICES: Final = (h264.SLICE, h264.IDR)
 _HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
@@ -259,11 +259,11 @@ class AccessUnit:
 
     data: bytes
     is_key: bool  #: whether decoding can begin here
-    arrived_ns: int  #: when its first piece arrived
+    arrived_ns: int  #: when the image's first piece arrived
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
     whole: bool  #: whether the image seems to be complete
     number: int = 0  #: count of images that have arrived
-    width: int = 0  #: width according to the newest parameter set [px]; 0 before the first one
+    width: int = 0  #: width according to the newest parameter set [px]; 0 before the first parameter set
     height: int = 0
 
 
@@ -275,7 +275,7 @@ def pieces(picture: bytes) -> list[bytes]:
 class Assembly:
     """Assembles images from pieces in order of arrival. Never raises, regardless of input.
 
-    ``stray`` counts bytes that don't belong to any image, ``missing`` counts images missing from the stream's numbers.
+    ``stray`` counts bytes that don't belong to any image; ``missing`` counts images missing from the stream's numbers.
     """
 
     def __init__(self) -> None:
@@ -286,7 +286,7 @@ class Assembly:
         self._arrived_ns = 0
         self._sequence: h264.Sequence | None = None
         self._before: h264.Slice | None = None
-        self._gap = True  # whether there was a gap since the last returned image
+        self._gap = True  # whether there was a gap after the last returned image
         self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
@@ -294,7 +294,7 @@ class Assembly:
         found = []
         begins = piece.startswith(h264.START)
         if begins and self._has_picture():
-            found += self._end(whole=False)  # the last piece is missing, unless it happened to be as long as the others
+            found += self._end(whole=False)  # the last piece is missing, unless it was by chance as long as the others
         if not begins and not self._pieces:
             self.stray += len(piece)
             self._gap = True
@@ -341,7 +341,7 @@ class Assembly:
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
-        """Return whether this image's number does not follow the previous one, and store the number."""
+        """Store this image's number; return True unless it directly follows the previous image's number."""
         try:
             for unit in head:
                 if h264.unit_type(unit) == h264.SPS:

@@ -55,7 +55,7 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. A file's head is read once to determine its image size; a live camera is not opened."""
+        """Return the camera. A file's start is read once to determine its image size; a live camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
@@ -133,7 +133,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams. It consists only of counters, because nothing is flying."""
+        """Publish feedback while the camera streams. Feedback consists only of counters, because nothing is flying."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))
@@ -179,14 +179,14 @@ _AUTO: Final = "auto"
 
 @dataclass(frozen=True, slots=True)
 class DeviceOptions:
-    """Settings for a local camera; those not given are left unchanged."""
+    """Settings for a local camera; settings that are not given are left unchanged."""
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
     gain: int | str = ""  #: gain in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
-        """Set exposure and gain; return a readable text for each failure."""
+        """Set exposure and gain; return a readable description of each failure."""
         if self.exposure == "" and self.gain == "":
             return []
         try:

@@ -1,4 +1,4 @@
-"""Plays video files (PaVE streams, and all that PyAV opens) into a sink according to their own time stamps."""
+"""Plays video files (PaVE streams, and everything that PyAV opens) into a sink according to their own time stamps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FFmpegError = av.error.FFmpegError
 
 CHUNK: Final = 1 << 16  #: number of bytes per read
-SNIFF: Final = 1 << 18  #: number of bytes within which a PaVE stream has a header, wherever it was cut
+SNIFF: Final = 1 << 18  #: a PaVE stream contains a header within this many bytes, wherever the stream was cut
 DEFAULT_FPS: Final = 30.0  #: frame rate if the file does not specify it
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
@@ -43,10 +43,10 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: Unit | None = None  #: the image as encoded, if that is relayed unchanged
-    number: int = 0  #: its number in the stream
-    reason: str = ""  #: why this image is not relayed although its stream is
-    turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
+    coded: Unit | None = None  #: the encoded image, if it is relayed unchanged
+    number: int = 0  #: the image's number in the stream
+    reason: str = ""  #: reason for not relaying this image of a relayed stream
+    turns: int = 0  #: number of counter-clockwise quarter turns that make the image upright
 
 
 def is_device(path: Path) -> bool:
@@ -111,7 +111,7 @@ class ContainerSource:
                 coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
-            except (FFmpegError, ValueError):  # a damaged packet: the decoder continues with the next one
+            except (FFmpegError, ValueError):  # after a damaged packet, the decoder continues with the next one
                 self.damaged += 1
                 continue
             for image in images:
@@ -140,7 +140,7 @@ class ContainerSource:
 def _quarter_turns(name: str) -> int:
     """Return the number of counter-clockwise quarter turns that make a file's images upright.
 
-    A phone held upright films sideways and stores a rotation matrix in the container; it is read with the images.
+    A phone held upright films sideways and stores a rotation matrix in the container, which is read with the images.
     """
     with suppress(FFmpegError, OSError, ValueError), av.open(name) as container:
         for image in itertools.islice(container.decode(container.streams.video[0]), 1):
@@ -195,13 +195,13 @@ Source = ContainerSource | PaveSource
 FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
 POLL_S: Final = 0.02  #: time between checks for a viewer
 BEHIND_NS: Final = 250_000_000  #: lag beyond which the schedule restarts instead of rushing to catch up
-GAP_S: Final = 2.0  #: maximum step between stamps; a longer one, or a step back, is a cut in the recording
+GAP_S: Final = 2.0  #: maximum step between stamps; a longer step, or a step back, is a cut in the recording
 
 
 class FilePacer:
     """Converts a file's own time stamps to the times at which its images are shown.
 
-    Times never go backwards. A jump in the stamps (a cut, a reset clock) counts as one ordinary period.
+    Times never go backwards. A jump in the stamps (caused by a cut or a clock reset) counts as one ordinary period.
     """
 
     def __init__(self, speed: float, period_s: float) -> None:
@@ -211,7 +211,7 @@ class FilePacer:
         self._due_ns = 0
 
     def due_ns(self, stamp_s: float, now_ns: int) -> int:
-        """Return when to show the image with this stamp, which was ready at ``now_ns``."""
+        """Return the time to show the image with this stamp, given that it was ready at ``now_ns``."""
         if self._stamp_s is None:
             self._due_ns = now_ns
         else:
@@ -264,7 +264,7 @@ class CameraPublisher:
         return False
 
     def publish_state(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Publish feedback if it is due; it consists only of the position in the file because nothing is flying."""
+        """Publish feedback if it is due: only the position in the file, because nothing is flying."""
         if now_ns < self._feedback_ns and not at_once:
             return
         self._feedback_ns = now_ns + FEEDBACK_NS

@@ -65,7 +65,7 @@ class FrameSize:
 
     width: int  #: width [px]; for a range, the largest
     height: int
-    fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, its two ends
+    fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, the two ends
     smallest: tuple[int, int] | None = None  #: the smallest size in a range
 
     def __str__(self) -> str:
@@ -145,7 +145,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure [ms], None for automatic; return why that failed, as readable text."""
+        """Set the exposure [ms], or automatic exposure for None; return the reason for a failure as readable text."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -155,11 +155,11 @@ class V4l2Device:
         lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
         if not lowest <= exposure_ms <= highest:
             return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
-        self._set(AUTO_EXPOSURE, _MANUAL)  # fails, harmlessly, on a device without automatic exposure
+        self._set(AUTO_EXPOSURE, _MANUAL)  # fails on a device without automatic exposure, which is harmless
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:
-        """Set the gain in the device's own unit, None for automatic; return why that failed, as readable text."""
+        """Set the gain in the device's own unit, or automatic gain for None; return a readable reason for a failure."""
         if gain is None:
             problem = self._set(AUTO_GAIN, 1)
             return f"the camera has no automatic gain: {problem}" if problem else ""
@@ -263,8 +263,8 @@ class CameraDevice:
     """A local camera."""
 
     path: Path  #: path such as ``/dev/video0``
-    name: str  #: name reported by its driver
-    allowed: bool  #: whether this user is allowed to open it
+    name: str  #: the device's name as reported by the driver
+    allowed: bool  #: whether this user is allowed to open the device
 
     def __str__(self) -> str:
         why = "" if self.allowed else ", but this user may not open it: sudo usermod -aG video $USER, and log in again"
@@ -274,7 +274,7 @@ class CameraDevice:
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
     """Return the local cameras in order of their numbers; an empty list if the system has no Video4Linux.
 
-    Of each camera, only the first node is listed, which is the one that captures images.
+    Only the first node of each camera is listed; that node captures images.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))

@@ -1,4 +1,4 @@
-"""An emulated AR.Drone 1 or 2 on the network, flying a simulated vehicle, for any program that flies the real one.
+"""An emulated AR.Drone 1 or 2 on the network that flies a simulated vehicle and accepts any program for the real drone.
 
 To use it on free local ports, as in a test::
 
@@ -11,8 +11,8 @@ To use it on free local ports, as in a test::
         ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP for version 1), .control (TCP)
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` drops
-datagrams in both directions (see :mod:`skyloop.faults`).
+``firmware.stop()`` and ``firmware.start()`` restart the firmware on the same ports. ``faults=Faults(seed=1, drop=0.1)``
+drops datagrams in both directions (see :mod:`skyloop.faults`).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ REPORTS_HZ: Final = 125.0  #: report rate that a world can sustain in real time
 
 
 def with_ardrones(options: SimOptions | None = None) -> SimOptions:
-    """Return the options for a world of AR.Drones: their identified response, and the highest navdata rate.
+    """Return the options for a world of AR.Drones, with their identified response and the highest navdata rate.
 
     The firmware has its own cameras and ignores those in the options.
     """
@@ -85,12 +85,12 @@ MOST: Final = 8  #: maximum number of recipients of datagrams
 class Listeners:
     """Recipients' addresses, each with its own sequence.
 
-    There are at most :data:`MOST`; a further one replaces the one that has made no request for longest. As with the
+    There are at most :data:`MOST` recipients; a new one replaces the one whose last request is the oldest. As with the
     real drone, requests need not be repeated.
     """
 
     def __init__(self) -> None:
-        self._sequences: dict[Address, int] = {}  # ordered by the time of the last request
+        self._sequences: dict[Address, int] = {}  # ordered by the time of each recipient's last request
 
     def refresh(self, address: Address) -> bool:
         """Record a request from an address; return whether the address is new."""
@@ -120,8 +120,8 @@ _READ: Final = 4096
 class Outlet:
     """The connection to one client.
 
-    A client that reads too slowly loses whole pieces of the stream, from the first one that does not fit until the next
-    one that can be decoded without its predecessors.
+    A client that reads too slowly loses whole pieces of the stream, from the first piece that does not fit up to the
+    next piece that can be decoded on its own.
     """
 
     def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
@@ -152,7 +152,7 @@ class Outlet:
             self._write()
 
     def skip_to_start(self) -> None:
-        """Drop pieces until the next one with which a stream can begin."""
+        """Drop pieces until the next piece that can begin a stream."""
         self._skipping = True
 
     def close(self) -> None:
@@ -413,7 +413,7 @@ VERSIONS: Final = (1, 2)
 
 
 class ArdroneFirmware(Emulator[RunningFirmware]):
-    """The firmware of one drone in a host's world. Several can share a host, each with its own drone and ports.
+    """The firmware of one drone in a host's world. Several drones can share a host, each with its own ports.
 
     Create the host with options from :func:`with_ardrones`. Full navdata is sent at the host's report rate
     (:attr:`skyloop.sim.options.SimOptions.rate_hz`), but at 125 Hz at most; real drones send it at 200 Hz.
@@ -428,7 +428,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
         torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
-            client, however old, and then the frames that follow, key frames or not. Otherwise its stream begins with
+            client, however old, and then the frames that follow, key frames or not. If False, its stream begins with
             the next key frame.
 
     Raises:
@@ -465,7 +465,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     @property
     def ports(self) -> Ports:
-        """The actual ports, including those chosen where 0 was given."""
+        """The actual ports, including those that the system chose where 0 was given."""
         return self._started.ports
 
     @property

@@ -34,7 +34,7 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: Limits that come in three versions: the current one, one for indoors and one for outdoors.
+#: Limits that come in three versions: the current limit, one for indoors and one for outdoors.
 TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
 #: Values in the emulated firmware (2.4.8 and 1.7.4) that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
@@ -49,14 +49,14 @@ _FACTORY: Final[dict[int, dict[str, Value]]] = {
     2: {"general:num_version_soft": "2.4.8"},
 }
 _CODECS: Final = {1: (VideoCodec.UVLC,), 2: tuple(codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P)}
-_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each channel shows one camera or a pair
+_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version; each channel carries one camera or a pair
 
 
 class Configuration:
     """All keys of an AR.Drone 1 or 2. Ignores invalid values received from clients and never raises.
 
-    A number out of range is clamped; no source says what the drone does with it. A key in the category session, user
-    or application has a separate value for each id; new ids begin with the factory values.
+    A number out of range is clamped; no source says what a real drone does in that case. A key in the category session,
+    user or application has a separate value for each id; new ids begin with the factory values.
     """
 
     def __init__(self, version: int) -> None:
@@ -167,7 +167,7 @@ class Configuration:
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 
     def _understood(self, key: Key, text: str) -> Value | None:
-        """Return the value that a text stands for; None if it is invalid."""
+        """Return the value that a text stands for; None if the text is invalid."""
         try:
             value = parse_value(text, _as_number(key.default))
         except DecodeError:

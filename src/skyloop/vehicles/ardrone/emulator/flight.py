@@ -73,7 +73,7 @@ def set_point(
     most_tilt = configuration.number("control:euler_angle_max")
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        # The command is relative to the remote control's heading: rotate it by the difference from the drone's.
+        # The command is relative to the remote control's heading: rotate it by the difference to the drone's heading.
         right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
@@ -91,7 +91,7 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: time without commands before it hovers: general:com_watchdog in the guide (unverified)
+HOVER_AFTER_S: Final = 0.25  #: time without commands before hovering: general:com_watchdog in the guide (unverified)
 LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lost
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
 BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no longer counts as low; an estimate
@@ -150,7 +150,7 @@ class FlightControl:
     def follow(self, progress: Progress, now_ns: int) -> None:
         """Handle ``PCMD`` or ``PCMD_MAG``.
 
-        A command with a number that is not finite is ignored. During a magnetometer calibration it is only stored.
+        A command with a number that is not finite is ignored. During a magnetometer calibration, it is only stored.
         """
         if not progress.makes_sense:
             return
@@ -168,12 +168,12 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: use the current attitude as level. Refused in the air."""
+        """Handle ``FTRIM``: use the current attitude as level. The request is refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
     def calibrate(self, device: int, now_ns: int) -> None:
-        """Handle ``CALIB``: turn once on the spot. Refused on the ground, and by an AR.Drone 1."""
+        """Handle ``CALIB``: turn once on the spot. This is refused on the ground, and always by an AR.Drone 1."""
         if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
             return
         self.calibrations += 1
@@ -196,7 +196,7 @@ class FlightControl:
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Check the battery, the angles and, by the time since the last command, the link. Called regularly."""
+        """Check the battery, the angles, and the link (from the time since the last command). Called regularly."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:
@@ -223,7 +223,7 @@ class FlightControl:
         elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
             self._emergency = State(0)
             self._toggle_ready = False
-        # A reset during the fall is ignored. It takes effect on the ground if the bit is still set.
+        # A reset during the fall is ignored. The reset takes effect on the ground if the emergency bit is still set.
 
     def _watch_battery(self, believed: VehicleFeedback) -> None:
         least_mv = self._configuration.number("general:vbat_min")

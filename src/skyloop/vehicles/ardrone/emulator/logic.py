@@ -27,7 +27,7 @@ class CommandSequence:
 
     After two seconds without an accepted command, any number greater than 0 is accepted. The Developer Guide says that
     clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost,
-    so this one does not.
+    so the emulated drone does not insist on it.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class CommandSequence:
         self._taken_ns: int | None = None
 
     def takes(self, number: int, now_ns: int) -> bool:
-        """Return whether to execute a command with this number that was received now."""
+        """Return whether to execute a command that has this number and arrived now."""
         if self._taken_ns is not None and now_ns - self._taken_ns > nanoseconds(SILENCE_RESET_S):
             self._last = 0
         if number != RESTART and number <= self._last:

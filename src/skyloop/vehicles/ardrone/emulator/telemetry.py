@@ -93,8 +93,8 @@ def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
 def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
     """Return the tags of the options to send, in ascending order, for the mask ``general:navdata_options``.
 
-    In demo mode these are the tags in the default mask and in the configured one. In full mode they are those in the
-    configured mask or, if it is still the default, all of them: real drones send all to programs that never set it.
+    In demo mode, these are the tags in the default and the configured mask. In full mode, these are the tags in the
+    configured mask, or all tags if that is the default mask: real drones send all options to clients that never set it.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL
@@ -226,7 +226,7 @@ def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
     return lambda _: option
 
 
-#: Functions that make the options, by tag. Options without any values to report are all zero, and 27 is ``Gps``.
+#: Functions that make the options, keyed by tag. Options without any values to report are all zero, and 27 is ``Gps``.
 _MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
     **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
     **{0: _demo, 1: lambda s: o.Time(s.time), 2: _raw, 3: _physical, 5: _euler_angles},

@@ -1,7 +1,7 @@
 """The AR.Drones' cameras, clock, video formats and encoders. Pure.
 
-An AR.Drone 1 encodes its video with UVLC. The format and its sources are documented with the decoder,
-:mod:`skyloop.vehicles.ardrone.wire.uvlc`, with which the encoder shares only the tables. Like the Parrot SDK's encoder,
+An AR.Drone 1 encodes its video with UVLC. The encoder shares only the tables with the decoder,
+:mod:`skyloop.vehicles.ardrone.wire.uvlc`, which documents the format and its sources. Like the Parrot SDK's encoder,
 this one sends only intra pictures, codes every macroblock, truncates levels towards zero, continues the Developer
 Guide's table of levels beyond its end at 127 by the table's own rule, and pads each picture with zeros to a whole word.
 """
@@ -161,8 +161,8 @@ def encode(
     """Encode an image (BGR, uint8, shape (height, width, 3), with one of the format's sizes) as one datagram.
 
     Macroblocks that would be partly outside the image are omitted, as the format requires. ``quant`` is 1 (finest) to
-    30, or 31, which is like 2 and is the one that real drones use; an image that would need more than ``max_bytes`` is
-    quantised more coarsely. Raises :class:`UsageError` if an argument is out of range, or the image never fits.
+    30, or 31, which is like 2 and is the value that real drones use; an image that would need more than ``max_bytes``
+    is quantised more coarsely. Raises :class:`UsageError` if an argument is out of range, or if the image never fits.
     """
     _check(picture, number, quant)
     height, width = picture.shape[:2]
@@ -209,7 +209,7 @@ def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _quantised(coefficients: NDArray[np.float32], quant: int) -> Ints:
     levels: Ints = (coefficients / uvlc.STEPS[quant].astype(np.float32)).astype(np.int64)
-    # The mean is rounded because truncation would darken the picture. As in the Parrot SDK, it is never 0.
+    # The mean is rounded because truncation would darken the picture. As in the Parrot SDK, the mean is never 0.
     mean = np.rint(coefficients[..., 0] / uvlc.STEPS[quant][0])
     levels[..., 0] = np.clip(mean, 1, (1 << uvlc.DC_BITS) - 1)
     return levels
@@ -240,7 +240,7 @@ def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> 
 
 
 def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
-    """Return the zeros that pad to the next multiple of ``size`` bits."""
+    """Return the zero bits needed to reach the next multiple of ``size`` bits."""
     return np.zeros(-sum(map(len, bits)) % size, np.uint8)
 
 
@@ -250,7 +250,7 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
     values, widths, block_of_pair = _pair_codes(blocks)
     pairs = np.bincount(block_of_pair, minlength=len(blocks))
     described = 0x80 | ((pairs > 0).reshape(-1, uvlc.BLOCKS) << np.arange(uvlc.BLOCKS)).sum(axis=1)
-    # A block's mean is placed before its pairs, and in the first block after the macroblock's description.
+    # A block's mean comes before its pairs and, in the first block, after the macroblock's description.
     is_first = np.arange(len(blocks)) % uvlc.BLOCKS == 0
     ends = np.cumsum(1 + is_first + pairs)
     means = ends - pairs - 1
@@ -267,7 +267,7 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
 def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
     """Return a code for each nonzero coefficient, with its width in bits and its block's index.
 
-    A code includes the run of zeros before its coefficient, and the last one in a block includes the end of the block.
+    A code includes the run of zeros before its coefficient, and the last code in a block includes the end of the block.
     """
     block, place = np.nonzero(blocks[:, 1:])
     level = blocks[block, place + 1]
@@ -285,7 +285,7 @@ def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def _prefixed(number: Ints) -> tuple[Ints, Ints]:
-    """Return the codes for numbers, and the width of each in bits.
+    """Return the numbers' codes and each code's width in bits.
 
     A number is coded as one zero for each of its bits, then those bits; 0 is coded as a one.
     """

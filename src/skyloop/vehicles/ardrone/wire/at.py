@@ -1,8 +1,8 @@
 """The AR.Drone's AT commands (UDP port 5556): format and parse their text lines. Pure.
 
-A command is ``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several, but none spans two.
-Numbers are signed decimals, texts are in double quotes, and a float is sent as the signed integer with the same 32
-bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` in the AR.Drone SDK 2.0.1.
+A command is ``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several commands, but no
+command spans two. Numbers are signed decimals, strings are in double quotes, and a float is sent as the signed integer
+with the same 32 bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` in the AR.Drone SDK 2.0.1.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ AtMessage: TypeAlias = tuple[str, tuple[Argument, ...]]
 class Ref(IntFlag):
     """Bits of ``REF``."""
 
-    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors or, in an emergency, ends it
+    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors or, in an emergency, ends the emergency
     TAKEOFF = 1 << 9  #: 1: take off and stay in the air; 0: land and stay on the ground
     FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, which the guide requires, although no drone seems to need them
 
@@ -64,7 +64,7 @@ class AtCommand:
 
 
 def format_command(name: str, sequence: int, *arguments: Argument) -> bytes:
-    """Return one line; raise :class:`UsageError` for a float that is not finite, a quote in a text or a long line."""
+    """Return one line; raise :class:`UsageError` for a float that is not finite, a quote in a text, or a long line."""
     words = [str(sequence), *(_word(argument) for argument in arguments)]
     line = f"AT*{name}={','.join(words)}\r".encode("latin-1", "replace")
     if len(line) > MAX_LINE:

@@ -1,12 +1,12 @@
 """The AR.Drone's configuration: its keys, the text form of their values, and the dump on TCP port 5559. Pure.
 
-``AT*CONFIG`` sets a key to a value given as text. The drone sends all keys as ``section:key = value`` lines, followed
-by a zero byte.
+``AT*CONFIG`` sets a key to a text value. The drone sends all keys as ``section:key = value`` lines, followed by a zero
+byte.
 
 Sources: the AR.Drone SDK 2.0.1 (``ardrone_tool/Control``) and a dump from an AR.Drone 1 with firmware 1.7.4. The keys'
-names, categories and most defaults come from the SDK's ``config_keys.h``, keys that only an AR.Drone 1 has from the
-dump, and ranges, where given, from chapter 8 of the Parrot AR.Drone Developer Guide. The animations' names and order
-come from ``ardrone_api.h``, their durations from the requests that the SDK's applications make.
+names, categories and most defaults come from the SDK's ``config_keys.h``. Keys that only an AR.Drone 1 has come from
+the dump. Ranges, where given, come from chapter 8 of the Parrot AR.Drone Developer Guide. The animations' names and
+order come from ``ardrone_api.h``, their durations from the requests that the SDK's applications make.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def format_value(value: Value) -> str:
 
 
 def parse_value(text: str, like: Value) -> Value:
-    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if it is not of that type."""
+    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if the text is not of that type."""
     text = text.strip()
     try:
         if isinstance(like, bool):

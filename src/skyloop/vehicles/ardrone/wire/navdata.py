@@ -255,7 +255,7 @@ Altitude = _declared(
 VisionRaw = _declared(11, "VisionRaw", "f tx ty tz")
 #: Optical flow in five zones.
 VisionOpticalFlow = _declared(12, "VisionOpticalFlow", "5f dx dy")
-#: The inputs to the vision-based velocity estimate.
+#: Inputs to the vision-based velocity estimate.
 Vision = _declared(
     13,
     "Vision",

@@ -111,8 +111,8 @@ def build_header(
 class PaveParser:
     """Splits a byte stream into frames, however the input is divided or damaged.
 
-    After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame,
-    ``broken_frames`` counts truncated frames. It buffers at most one frame (``max_payload`` and a header) in addition
+    After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame;
+    ``broken_frames`` counts truncated frames. At most one frame (``max_payload`` and a header) is buffered in addition
     to the bytes from the last call.
     """
 
@@ -170,7 +170,7 @@ class PaveParser:
         return None
 
     def _break_off(self, header: _Header) -> bool:
-        """Return whether another frame begins within this one's payload, as after a wrong length or missing bytes.
+        """Return whether another frame begins within this frame's payload, as after a wrong length or missing bytes.
 
         Without this check, one flipped bit in a length could lose all the frames within that length.
         """
@@ -188,7 +188,7 @@ class PaveParser:
         return False
 
     def _is_followed_well(self, header: _Header) -> bool:
-        """Return whether another frame begins right after this one; if not, some bytes of this one are wrong."""
+        """Return whether another frame begins right after this one; if not, some bytes of this frame are wrong."""
         end = header.size + header.payload_size
         return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 

@@ -10,21 +10,21 @@ run and level codes (see below). No recording of this video is public; the sourc
   pictures with them: the order of the coefficients, and the steps for quantiser 31; the latter also prints the first 12
   bytes of a picture.
 
-Where they disagree, this module does what is known to work with real drones:
+Where the sources disagree, this module does what is known to work with real drones:
 
 * If a macroblock's first bit is set, it is *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
 * Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if the quantiser is 31 ("the old
-  table", Parrot SDK since 1.8). For 31, the only one seen from real drones, this is python-ardrone's fixed table
-  3, 5, 7 …. No picture was found that needs the H.263-like rule mentioned in older comments in the SDK.
+  table", Parrot SDK since 1.8). For quantiser 31, the only one seen from real drones, this equals python-ardrone's
+  fixed table 3, 5, 7 …. No picture was found that needs the H.263-like rule mentioned in older comments in the SDK.
 * The mean is unsigned (Parrot SDK, python-ardrone). The guide's example is negative, but then white would not fit.
 * Groups start on a byte (uvlc.txt, Parrot SDK, python-ardrone) or on a word (djtrance): both are accepted.
 * Luma and chroma use the full range of BT.601 (as in the Parrot SDK's conversion; python-ardrone used 16 to 235).
 * A quantiser change (uvlc.txt: −1, −2, +1, +2; the SDK's encoder and decoder disagree) applies until the end of the
   group; at 31 it is read and ignored, as in python-ardrone.
-* Macroblocks that would be partly outside the picture are not coded (Parrot SDK): for 88x72, 80x64 is coded, and for
-  160x120, 160x112.
+* Macroblocks that would be partly outside the picture are not coded (Parrot SDK): of an 88x72 picture, 80x64 pixels are
+  coded, and of a 160x120 picture, 160x112 pixels.
 * P pictures have never been seen. Their coded macroblocks are complete in themselves (Parrot SDK). As in H.263, from
-  which the guide derives the codec, the others repeat the previous picture, whose number must be one lower.
+  which the guide derives the codec, uncoded macroblocks repeat the previous picture, whose number must be one lower.
 
 There is no checksum, so a damaged packet can pass for a picture. The decoder checks everything that the format allows.
 
@@ -44,8 +44,8 @@ run      code                          level    code
 The end of a block is coded as a level, after a run of 0.
 
 Reading bit by bit would be far too slow in Python. Instead, for each window of 16 bits, a table lists the whole pairs
-with which it begins and the distance to the next window. The reader only steps from window to window, recording its
-track, which NumPy turns into coefficients.
+at its beginning and the distance to the next window. The reader only steps from window to window, recording its track,
+which NumPy turns into coefficients.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from skyloop.errors import DecodeError
 # Constants and tables, for the emulator's encoder as well ------------------------------------------------------------
 
 START_CODE_BITS: Final = 22
-UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this plus k
+UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; add k for group k
 P264_START: Final = 0x40  #: start code of the drone's other codec
 END_OF_PICTURE: Final = 0x3F  #: code that marks the end where group 31 would start
 MAX_GROUPS: Final = 31
@@ -134,8 +134,8 @@ def _inverse_transform() -> NDArray[np.float32]:
     return np.kron(basis, basis)[ZIGZAG].astype(np.float32)
 
 
-#: Multiplying coefficients (…, 64) in stream order by this gives samples (…, 64) row by row; its transpose is the
-#: inverse. Orthonormal: the first coefficient is 8 times the mean.
+#: Multiplying coefficients (…, 64) in stream order by this matrix gives samples (…, 64) row by row; its transpose is
+#: its inverse. Orthonormal: the first coefficient is 8 times the mean.
 INVERSE_TRANSFORM: Final = _inverse_transform()
 
 
@@ -144,16 +144,16 @@ INVERSE_TRANSFORM: Final = _inverse_transform()
 WINDOW: Final = 16  #: number of bits per table lookup
 PADDING: Final = 32  #: number of zero bytes appended to the packet, so that no lookup goes past the end
 _PAIRS: Final = 5  #: maximum number of whole pairs in a window; the shortest pair takes 3 bits
-_MAX_LEVEL_ZEROS: Final = 11  #: limit that allows levels below 2048; pictures of 8-bit samples have none greater
+_MAX_LEVEL_ZEROS: Final = 11  #: limit that allows levels below 2048; pictures of 8-bit samples have no greater levels
 
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class PairTable:
-    """The pairs with which each window of 16 bits begins."""
+    """The pairs at the beginning of each window of 16 bits."""
 
-    step: NDArray[np.int8]  #: (65536,) bits in the whole pairs; negative if the block ends with them, 0 without any
+    step: NDArray[np.int8]  #: (65536,) bits in the whole pairs; negative if the block ends with them, 0 for none
     count: NDArray[np.int64]  #: (65536,) number of pairs
     advance: NDArray[np.int64]  #: (65536 · 5,) run + 1 of each pair
     level: NDArray[np.int16]  #: (65536 · 5,) level of each pair
@@ -264,7 +264,7 @@ class BlockWalker:
     def levels(self) -> NDArray[np.float32]:
         """Return the levels of all blocks so far, in stream order; those at the position of the mean are 0.
 
-        Shape (blocks, 64). Raises DecodeError for a block with more than 64.
+        Shape (blocks, 64). Raises DecodeError for a block with more than 64 levels.
         """
         count = self._table.count[keys := self._windows[np.array(self._visits, np.int64)].astype(np.int64)]
         long_visit, long_advance, long_level = np.array(self._long, np.int64).reshape(-1, 3).T
@@ -290,7 +290,7 @@ class BlockWalker:
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 MAX_PACKET: Final = 65_535  #: maximum size of a picture, which is one datagram [bytes]
-_MAX_TAIL_BITS: Final = 64  # number of zero bits after the end of the picture that are too many for padding
+_MAX_TAIL_BITS: Final = 64  # more zero bits than this after the end of the picture are too many for padding
 # Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
 # also be rounded up by half a step.
 _MAX_DC: Final = 2048
@@ -318,7 +318,7 @@ class UvlcPicture(UvlcHeader):
 
 
 def is_p264(packet: bytes | bytearray | memoryview) -> bool:
-    """Return whether a datagram begins like a P264 picture; that is the drone's other codec, which is not supported."""
+    """Return whether a datagram begins like a picture in P264, the drone's other codec, which is not supported."""
     return len(packet) >= 4 and int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
 
 
@@ -339,7 +339,7 @@ class UvlcDecoder:
         """Return the picture in a datagram.
 
         Raises DecodeError for anything but one complete picture (truncated or damaged data, another codec
-        (:func:`is_p264`), or changes to a picture other than the previous one), and is then ready for the next.
+        (:func:`is_p264`), or changes to a picture other than the previous one). It is then ready for the next picture.
         """
         reader = _Reader(bytes(packet))
         header = reader.read_header()
@@ -351,7 +351,7 @@ class UvlcDecoder:
         return UvlcPicture(header.number, header.type, header.quant, header.width, header.height, pixels)
 
     def _before(self, header: UvlcHeader) -> Samples | None:
-        """Return the samples that a picture depends on; None if it is complete in itself."""
+        """Return the samples that a picture depends on; None if the picture is complete in itself."""
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
@@ -444,7 +444,7 @@ class _Reader:
         for k in range(count):
             try:
                 quant = self._read_macroblock(quant)
-                # Checking here is enough: the windows extend beyond the packet by more than one empty macroblock.
+                # This check is enough, because the windows extend beyond the packet by more than one empty macroblock.
                 if self._at > self._end:
                     raise DecodeError("the packet ends before it does")
             except DecodeError as error:

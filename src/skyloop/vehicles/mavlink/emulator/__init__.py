@@ -96,7 +96,7 @@ BOOT_S: Final = 2.0
 
 
 class MavlinkFirmware(Emulator[RunningFirmware]):
-    """The autopilot of one drone in a host's world. Several may share a host, each with its own drone and ports.
+    """The autopilot of one drone in a host's world. Autopilots may share a host, each with its own drone and ports.
 
     Create the host with options from :func:`with_multirotors`.
 
@@ -109,10 +109,10 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         system: MAVLink system id, 1 to 255; None for the drone's number plus one.
         faults: Faults injected into UDP datagrams in both directions.
         delay_s: Delay added to UDP datagrams in each direction.
-        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real ones take 5 to 40).
+        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real vehicles take 5 to 40).
         gps: Whether the vehicle has GPS; without it, the autopilot is not ready until external poses arrive.
-        version: 1 if it supports only MAVLink 1.
-        key: 32-byte key with which everything is signed; None to sign nothing.
+        version: 1 if the autopilot supports only MAVLink 1.
+        key: 32-byte key for signing all messages; None to sign nothing.
         video: Host and port for the front camera's video over UDP; None for no camera.
         loop: Thread shared by a fleet, to be started after all its members and stopped before any of them; None for
             a separate thread.
@@ -153,7 +153,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
-        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports for a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports reserved for a restart
         return running
 
     @property

@@ -114,7 +114,7 @@ class ArduCopter(Autopilot):
             self._rising = not self._manoeuvres.rise()
             return
         if not self.flight.airborne:
-            return  # only the command can start a take-off
+            return  # only a take-off command can start a take-off
         if self._target is not None and self.time_s - self._target_s > self.parameters["GUID_TIMEOUT"]:
             if isinstance(self._target, AttitudeTarget):
                 self.flight.lean(0.0, 0.0, 0.0, 0.0)  # level attitude, so the vehicle continues to drift
@@ -132,7 +132,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without MAVLink input, a simulated one with its throttle down applies."""
+        """Follow the remote control. Without MAVLink input, a simulated remote control with low throttle applies."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:
@@ -209,7 +209,7 @@ class ArduCopter(Autopilot):
         return Result.ACCEPTED
 
     def _disarmed(self) -> None:
-        """Keep the mode: after a landing it is LAND, in which arming is not possible."""
+        """Keep the mode, which is LAND after a landing and does not allow arming."""
 
     # Arming and taking off -------------------------------------------------------------------------------------
 
@@ -262,7 +262,7 @@ class ArduCopter(Autopilot):
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target with a position relative to the vehicle, as in all frames but one."""
+        """Return a target whose position is relative to the vehicle; this is the case in all frames but one."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target
@@ -335,7 +335,7 @@ class ArduCopter(Autopilot):
         self._paused = not order
         return Result.ACCEPTED
 
-    def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  the command has none
+    def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  the command has no arguments
         major, minor = self.VERSION >> 24, self.VERSION >> 16 & 0xFF
         for text in (f"ArduCopter V{major}.{minor}.0-dev (emulated by Skyloop)", "Frame: QUAD/X"):
             self.send_text(text, INFO)

@@ -26,7 +26,7 @@ FORCE: Final = 21196  #: parameter of the disarm command that means "even in fli
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
-AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until it disarms
+AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until the vehicle disarms
 _GCS: Final = 6  #: MAV_TYPE of a ground station
 #: Messages unaffected by the old request for messages.
 _ON_REQUEST: Final = (
@@ -64,8 +64,8 @@ class Autopilot(AutopilotState):
     LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of the position in COMMAND_LONG, for each command that accepts one
     NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
-    DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
-    WORDS: ClassVar[dict[str, str]]  #: texts for being armed, disarmed, auto_disarm (on the ground) and landed
+    DISARM_S: ClassVar[float]  #: time after which a vehicle armed on the ground disarms
+    WORDS: ClassVar[dict[str, str]]  #: texts for the events armed, disarmed, auto_disarm (on the ground) and landed
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, boot_s, gps)
@@ -80,7 +80,7 @@ class Autopilot(AutopilotState):
         self._captured_ns = 0
         self._armed_s = 0.0
         self._landed_s: float | None = None
-        self._flown = False  # whether it has flown since it was armed
+        self._flown = False  # whether the vehicle has flown since it was armed
         self._gcs_s: float | None = None
         self._text = 0
         self._commands: dict[int, Handler] = {
@@ -152,7 +152,7 @@ class Autopilot(AutopilotState):
                 port.send(parameter)
 
     def send_text(self, text: str, severity: int = WARNING) -> None:
-        """Send a text message on all links, in chunks if it is long."""
+        """Send a text message on all links, in chunks if the message is long."""
         self._text = self._text % 0xFFFF + 1
         for port in self.ports:
             for chunk in chunks_of(text, severity, self._text):
@@ -275,7 +275,7 @@ class Autopilot(AutopilotState):
         return maker(self) if maker is not None else None
 
     def _interval(self, port: Port, number: int) -> Message | None:
-        if not 0 <= number <= 0xFFFF:  # it does not fit in the reply
+        if not 0 <= number <= 0xFFFF:  # the number does not fit in the reply
             return None
         return m.MAVLink_message_interval_message(number, port.streams.interval_us(number))
 
@@ -326,11 +326,11 @@ class Autopilot(AutopilotState):
 
     @abstractmethod
     def _refuse_arming(self) -> int | None:
-        """Return the result code of a refusal to arm, after sending its text; None if arming is allowed."""
+        """Return the result code for refusing to arm, after sending the reason as a text; None if arming is allowed."""
 
     @abstractmethod
     def _refuse_disarming(self) -> int:
-        """Return the result code of a refusal to disarm in flight."""
+        """Return the result code for refusing to disarm in flight."""
 
     def _datum(self, frame: int) -> float | None:
         """Return the height [m] above the flight's origin where a frame's altitude is 0; None for an unknown frame."""

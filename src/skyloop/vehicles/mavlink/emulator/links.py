@@ -33,7 +33,7 @@ class Ports:
 
     udp: int  #: the autopilot's own UDP port, which sends to ``remote`` until a message arrives
     remote: int  #: UDP port of the other end
-    tcp: int | None = None  #: port of the TCP server for one client; None if it has none
+    tcp: int | None = None  #: port of the TCP server for one client; None if there is no server
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:
@@ -46,7 +46,7 @@ class Ports:
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
         """Return ports numbered from a base, which increases by 10 per drone: UDP port, remote UDP port, TCP port.
 
-        The base is None for the standard ports, 0 for any free ones. Raises :class:`UsageError` for ports above 65535.
+        The base is None for the standard ports, 0 for any free ports. Raises :class:`UsageError` for ports above 65535.
         """
         if base is None:
             return cls.standard(kind, drone)
@@ -147,7 +147,7 @@ class Streams:
         return -1 if period_s is None else round(period_s * 1e6)
 
     def due(self, time_s: float) -> list[int]:
-        """Return the messages to send now, each only once, however late it is."""
+        """Return the messages to send now: each is returned only once, however late the call is."""
         found = []
         for number, period_s in self._periods.items():
             due_s = self._due[number]
@@ -220,7 +220,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time. The next one waits in the kernel's backlog, connected but without data."""
+    """A TCP server for one client at a time. The next client waits in the kernel's backlog, receiving nothing."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams

@@ -75,7 +75,7 @@ class Target:
 
 
 def target_of(message: Message) -> Target:
-    """Return the target from ``SET_POSITION_TARGET_LOCAL_NED``, even if it is not finite."""
+    """Return the target from ``SET_POSITION_TARGET_LOCAL_NED``, even if the target is not finite."""
     mask, in_body = message.type_mask, message.coordinate_frame in (BODY, BODY_OFFSET)
     turn = flip if in_body else swap
     return Target(
@@ -198,7 +198,7 @@ class Manoeuvres:
         return up >= self._rise_m - 0.1
 
     def begin_return(self, home: Vector, height_m: float, *, wait_s: float = 0.0, final_m: float | None = None) -> None:
-        """Start returning: climb, fly to ``home`` at that height, or as high as it can, wait there, and land.
+        """Start returning: climb, fly to ``home`` at that height (or as high as possible), wait there, and land.
 
         ``final_m`` is the height to descend to instead of landing; None to land.
         """

@@ -30,7 +30,7 @@ SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate if there is no remote control
 STICK_SPEED_M_S: Final = 10.0  #: speed at full stick (MPC_VEL_MANUAL)
 STICK_EXPO: Final = 0.6  #: how much a stick's response is flattened near its centre (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
 STICK_FILTER_S: Final = 0.1  #: time constant of the filter for a stick's speed
-LIFTS_OFF_AT: Final = 0.2  #: throttle at which it lifts off, as a fraction of the stick's travel upwards
+LIFTS_OFF_AT: Final = 0.2  #: throttle at which the vehicle lifts off, as a fraction of the stick's travel upwards
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 
 
@@ -85,7 +85,7 @@ class Px4(Autopilot):
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
         self._lost_gcs = False
-        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up and left turn, each 1 at full stick
+        self._stick = (0.0, 0.0, 0.0, 0.0)  # stick positions forward, left, up and left turn, each 1 at full stick
         self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # filtered speed of each stick [1/s]
         self._stick_s = -math.inf
         self._lost_stick_s: float | None = None  # when the remote control in use was lost
@@ -96,7 +96,7 @@ class Px4(Autopilot):
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its present mode."""
+        """Whether the autopilot can be armed in its present mode."""
         return self.mode != "OFFBOARD" or self._fresh
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  every ground station counts
@@ -111,7 +111,7 @@ class Px4(Autopilot):
 
     @property
     def remote(self) -> bool:
-        """Whether it receives a remote control, which may be a ground station's joystick."""
+        """Whether the autopilot receives a remote control, which may be a ground station's joystick."""
         return self.time_s - self._stick_s <= self.parameters["COM_RC_LOSS_T"]
 
     def _fly(self) -> None:
@@ -141,7 +141,7 @@ class Px4(Autopilot):
             self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
         elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost:
-            self.failsafe = False  # recovered: the user had chosen this mode
+            self.failsafe = False  # recovered: return to the mode that the user had chosen
             self._enter("OFFBOARD")
 
     @property
@@ -363,7 +363,7 @@ class Px4(Autopilot):
         self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
 
     def _check_sticks(self) -> None:
-        """In any mode, hold and then return once a remote control that was in use is lost."""
+        """In any mode, once a remote control in use is lost, hold position and then return."""
         if self.remote:
             if self._lost_stick_s is not None:  # the remote control came back before the return began
                 self.failsafe, self._lost_stick_s = False, None

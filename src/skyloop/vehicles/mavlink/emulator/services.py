@@ -69,7 +69,7 @@ class Mission:
         self._wanted = 0  # number of the item awaited in an upload; 0 if there is no upload
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the replies to a message; None if it is not about a mission."""
+        """Return the replies to a message; None if the message is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None
@@ -127,7 +127,7 @@ class Mission:
 
 
 def answers(message: Message) -> Iterable[Message]:
-    """Yield the replies to a message; none if it is not a request handled here."""
+    """Yield the replies to a message; none if the message is not a request handled here."""
     kind = message.get_type()
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "MISSION_REQUEST_LIST":

@@ -1,4 +1,4 @@
-"""An autopilot's state as reported by the simulation, and the MAVLink messages made from it, by number. Pure."""
+"""An autopilot's state as reported by the simulation, and the MAVLink messages made from it, keyed by number. Pure."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
 #: Estimator flags for a known position: relative and absolute, each current and predicted for flight. DroneKit waits
-#: for the last one.
+#: for the last flag.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
 POSES_S: Final = 1.0  #: how long external poses must arrive before the position is known without GPS
 POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
@@ -36,7 +36,7 @@ _LANDED: Final = {
 
 
 class AutopilotState(ABC):
-    """An autopilot's state, from which messages are made. Times are on its own clock [s]."""
+    """An autopilot's state, from which messages are made. Times are on the autopilot's own clock [s]."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     REPORTS_PREARM: ClassVar[bool] = True  #: whether SYS_STATUS marks the pre-arm check as present
@@ -55,44 +55,44 @@ class AutopilotState(ABC):
 
     @property
     def time_s(self) -> float:
-        """Time since it was switched on [s]."""
+        """Time since power-on [s]."""
         return 0.0 if self._begun_s is None else self.report.believed.time_s - self._begun_s
 
     @property
     def boot_ms(self) -> int:
-        """Time since it was switched on, as in 32-bit message fields [ms]."""
+        """Time since power-on, as in 32-bit message fields [ms]."""
         return round(self.time_s * 1000) % _COPIES
 
     @property
     def boot_ns(self) -> int:
-        """Time since it was switched on [ns]."""
+        """Time since power-on [ns]."""
         return round(self.time_s * 1e9)
 
     @property
     def has_origin(self) -> bool:
-        """Whether it has a position."""
+        """Whether the autopilot has a position."""
         if self.gps:
             return self.time_s >= self._boot_s / 2
         return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
 
     @property
     def settled(self) -> bool:
-        """Whether its estimator reports a good position, which is the last step of booting."""
+        """Whether the autopilot's estimator reports a good position, which is the last step of booting."""
         return self.time_s >= self._boot_s and self.has_origin
 
     @property
     def ready(self) -> bool:
-        """Whether it can be armed."""
+        """Whether the autopilot can be armed."""
         return self.settled and self.mode_allows_arming
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its present mode."""
+        """Whether the autopilot can be armed in its present mode."""
         return True
 
     @property
     def remote(self) -> bool:
-        """Whether it reports that it receives a remote control."""
+        """Whether the autopilot reports that it receives a remote control."""
         return False
 
     @property
@@ -113,7 +113,7 @@ class AutopilotState(ABC):
 
     @property
     def channels(self) -> list[int] | None:
-        """The remote control's pulse widths [µs]; None if it reports none."""
+        """The remote control's pulse widths [µs]; None if none are reported."""
         return None
 
 
@@ -189,7 +189,7 @@ def _ekf(a: AutopilotState) -> Message:
 
 
 def _estimator(a: AutopilotState) -> Message:
-    """Report the estimator's state. At rest it assumes a constant position (0x80), which still counts as known."""
+    """Report the estimator's state. At rest, it assumes a constant position (0x80), which still counts as known."""
     flags = 0x1 | 0x2 | 0x4 | 0x20 | (_PLACED if a.settled else 0x80)
     flags |= 0x80 if a.flight.standing else 0
     return m.MAVLink_estimator_status_message(a.boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)

@@ -73,11 +73,11 @@ _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITI
 
 
 class WorldAxes:
-    """Moves positions in messages between the world's axes and the autopilot's, which are parallel.
+    """Converts positions in messages between the world's axes and the autopilot's, which are parallel.
 
-    Needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while it uses
-    GPS, so several vehicles would each have their own. ``begin`` is the world's origin: latitude and longitude [°] and
-    altitude [m]; None for the autopilot's own.
+    This is needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while
+    it uses GPS, so each of several vehicles would have its own origin. ``begin`` is the world's origin: latitude and
+    longitude [°] and altitude [m]; None for the autopilot's own origin.
     """
 
     def __init__(self, begin: tuple[float, float, float] | None) -> None:
@@ -101,7 +101,7 @@ class WorldAxes:
         return kind != "LOCAL_POSITION_NED" or self._move(message, 1.0)
 
     def sent(self, message: Message) -> bool:
-        """Convert a position for the vehicle to its own axes; return whether to send the message."""
+        """Convert a position to the vehicle's own axes; return whether to send the message."""
         if self.begin is None or message.get_type() not in _POSITIONS:
             return True
         if getattr(message, "coordinate_frame", m.MAV_FRAME_LOCAL_NED) != m.MAV_FRAME_LOCAL_NED:

@@ -63,7 +63,7 @@ class _Kind(NamedTuple):
 
 @lru_cache(maxsize=512)  # bounded, because anybody can send invalid message numbers
 def _kind_of(number: int) -> _Kind | None:
-    """Return how to create messages of a type; None if the type is unknown or has strings or arrays."""
+    """Return how to create messages of a type; None if the type is unknown or contains strings or arrays."""
     made: Any = dialect.mavlink_map.get(number)
     if made is None or any(made.array_lengths) or set(made.lengths) != {1}:
         return None
@@ -186,8 +186,8 @@ class Codec:
     def decode(self, data: bytes, *, whole: bool = False, source: Hashable = None) -> list[Message]:
         """Return the messages that these bytes complete. Never raises, whatever the input.
 
-        ``whole`` means that they are one datagram from ``source``. A frame may continue in the sender's next datagram,
-        because some bridges divide a serial line's bytes anywhere.
+        ``whole`` means that the bytes are one datagram from ``source``. A frame may continue in the sender's next
+        datagram, because some bridges divide a serial line's bytes anywhere.
         """
         if not whole:
             return self._parsed(data)
@@ -196,7 +196,7 @@ class Codec:
             self.damaged += bool(rest)
             return self._decoded(data)
         if rest and _begins_with_a_frame(data):
-            rest = b""  # the rest of that frame never arrived
+            rest = b""  # the rest of the frame never arrived
             self.damaged += 1
         self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         found = self._parsed(rest + data)
@@ -258,7 +258,7 @@ _MOST_OPEN: Final = 8  #: maximum number of unfinished texts; beyond that, the o
 
 
 def chunks_of(text: str, severity: int, number: int) -> list[Message]:
-    """Split a text into messages. ``number`` is the text's id, or 0 if it fits in a single message."""
+    """Split a text into messages. ``number`` is the text's id, or 0 if the text fits in a single message."""
     data = text.encode("ascii", "replace")
     if len(data) < CHUNK:
         return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]
@@ -276,7 +276,7 @@ class Texts:
     def on_message(self, message: Message) -> list[tuple[int, str]]:
         """Return the texts completed by this message, with their severities (0 emergency to 7 debug).
 
-        A chunk that arrives twice, or after the last one of its text, does not start a new text.
+        A chunk that arrives twice, or after the last chunk of its text, does not start a new text.
         """
         text = _printable(message.text)
         number = message.id

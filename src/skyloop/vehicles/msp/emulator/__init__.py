@@ -11,7 +11,7 @@ To use it in a test::
         firmware.address  # for a driver: msp://tcp:127.0.0.1:…
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-Its barometer and GPS are the simulated vehicle's. It answers the driver's requests, and is set up as described in
+It uses the simulated vehicle's barometer and GPS. It answers the driver's requests, and is set up as described in
 ``docs/msp.md``.
 """
 
@@ -71,10 +71,10 @@ _ACTUAL: Final = AxisRates(7, 0, 67)
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
 #: Each mode's permanent number and name, in the order of the status bits, as in Betaflight 4.6 with default features.
 BOXES: Final = ((0, "ARM"), (1, "ANGLE"), (2, "HORIZON"), (27, "FAILSAFE"), (28, "AIR MODE"), (36, "PREARM"))
-#: Replies that consist of zeros, by number: their sizes in bytes.
+#: Replies that consist of zeros, keyed by number: their sizes in bytes.
 _ZEROS: Final = {10: 0, 38: 6, 50: 1, 52: 180, 58: 4, 70: 13, 79: 11, 82: 1, 133: 2}
-#: Replies of Betaflight 4.6.0 that don't depend on the emulator's state, by number: size in bytes, and the first bytes
-#: in hexadecimal; the rest are zeros. Recorded from its SITL at rest, with default settings.
+#: Replies of Betaflight 4.6.0 that don't depend on the emulator's state, keyed by number: size in bytes, and the first
+#: bytes in hexadecimal; the rest are zeros. They were recorded from Betaflight's SITL at rest, with default settings.
 RECORDED: Final[dict[int, tuple[int, str]]] = {
     **{number: (size, "") for number, size in _ZEROS.items()},
     5: (30, "4e6f76203236203230323631353a30343a323700484f52495a4f1f402b20"),
@@ -96,8 +96,8 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
-#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. This excludes
-#: 59, 61, 68 (which restarts it) and 69, which get other replies or none.
+#: Write functions with numbers up to 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here.
+#: The numbers 59, 61, 68 (which restarts the firmware) and 69 are excluded, because they get other replies or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
 )
@@ -117,7 +117,7 @@ class BoardSettings:
     rx_msp: bool = True
     gps: bool = True
     barometer: bool = True
-    boot_s: float = 0.5  #: time until it can be armed [s]; 5 s on real ones
+    boot_s: float = 0.5  #: time until arming is possible [s]; 5 s on real flight controllers
     flags: int = 0  #: additional flags that prevent arming, one bit each
 
 
@@ -135,10 +135,10 @@ NAME: Final = "EMULATED"
 FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: number of flags, including ARM_SWITCH
 LOSS_NS: Final = nanoseconds(0.15)  #: time without sticks after which the receiver counts as lost
 HOLD_NS: Final = nanoseconds(0.3)  #: how long the last sticks remain in force
-RECOVERY_NS: Final = nanoseconds(0.5)  #: how long sticks must arrive before the receiver counts as recovered
+RECOVERY_NS: Final = nanoseconds(0.5)  #: how long stick frames must arrive before the receiver counts as recovered
 IDLE: Final = 0.055  #: fraction of full throttle at which the motors idle while armed
-LEVEL_RAD: Final = math.radians(25.0)  #: maximum tilt at which it can be armed
-GROUND_M: Final = 0.06  #: height below which it counts as on the ground if its thrust is low
+LEVEL_RAD: Final = math.radians(25.0)  #: maximum tilt at which arming is possible
+GROUND_M: Final = 0.06  #: height below which a vehicle with low thrust counts as on the ground
 ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: arbitrary position of the world's origin on Earth
 SATELLITES: Final = 14
 _ROLL, _PITCH, _YAW, _THROTTLE = range(4)
@@ -152,7 +152,7 @@ def bit(name: str) -> int:
 class Board:
     """One flight controller. Not thread-safe: use it only on the loop's thread.
 
-    ``received`` has the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
+    ``received`` holds the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
     """
 
     def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:
@@ -160,7 +160,7 @@ class Board:
         self.armed = False
         self.received: list[int] = []
         self.frames = 0
-        self.silenced = False  #: whether it replies to nothing, as if the line were cut
+        self.silenced = False  #: whether it sends no replies, as if the line were cut
         self._flight = FlightControl(vehicle)
         self._report: Report | None = None
         self._begun_ns = now_ns
@@ -480,12 +480,12 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self._bind, self._port, self.settings, self._loop)
-        self._port = running.port  # keeps the port for a restart
+        self._port = running.port  # keeps the port reserved for a restart
         return running
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was requested."""
+        """The actual port; if 0 was requested, the system chose it."""
         return self._started.port
 
     @property

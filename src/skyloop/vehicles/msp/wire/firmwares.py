@@ -1,7 +1,7 @@
 """The firmwares' rate curves and their inverses, from rates and angles to sticks. Pure.
 
 Betaflight has five kinds of rates, plotted in its documentation. Since version 4.5, the tilt in ANGLE mode follows the
-same curve; before that, it was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
+same curve; before that, the tilt was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def share_of(curve: Curve) -> Curve:
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, for a value; full stick if the value can't be reached."""
+    """Return the stick position, -1 to 1, for a value; full stick if the value can't be reached."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:
@@ -131,7 +131,7 @@ def stick_for(curve: Curve, wanted: float) -> float:
     return -stick if wanted < 0 else stick
 
 
-#: Flags since Betaflight 4.1 (API 1.42), from bit 0; ARM_SWITCH is always a version's last flag.
+#: Flags since Betaflight 4.1 (API 1.42), from bit 0; ARM_SWITCH is the last flag in every version.
 BETAFLIGHT_FLAGS: Final = (
     *("NOGYRO", "FAILSAFE", "RXLOSS", "NOT_DISARMED", "BOXFAILSAFE", "RUNAWAY", "CRASH", "THROTTLE", "ANGLE"),
     *("BOOTGRACE", "NOPREARM", "LOAD", "CALIB", "CLI", "CMS", "BST", "MSP", "PARALYZE", "GPS", "RESCUE_SW"),
@@ -195,7 +195,7 @@ ARM: Final = "ARM"
 ANGLE: Final = "ANGLE"
 PREARM: Final = "PREARM"
 MSP_OVERRIDE: Final = ("MSP OVERRIDE", "MSP RC OVERRIDE")  #: Betaflight's and INAV's names
-ARMED_OF_INAV: Final = 1 << 2  #: bit in the flags of INAV's status that means armed
+ARMED_OF_INAV: Final = 1 << 2  #: bit in INAV's status flags that means "armed"
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:

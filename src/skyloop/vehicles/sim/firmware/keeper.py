@@ -1,9 +1,9 @@
 """Run flight firmware as the only child process, and end it when the parent of this process ends.
 
 ``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …`` writes
-the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives it priority,
-``--apart`` a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the firmware's or, as in
-a shell, 128 plus the number of the signal that ended it.
+the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives the firmware
+priority; ``--apart`` gives it a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the
+firmware's or, as in a shell, 128 plus the number of the signal that ended it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Final
 from skyloop.child_process import on_parent_end
 from skyloop.vehicles.sim.firmware import ports
 
-LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which is ahead of all ordinary processes
+LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which runs ahead of all ordinary processes
 NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
 SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
@@ -30,12 +30,12 @@ PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 _priority_lock: Final = threading.Lock()  # guards the two variables below, which are process-wide like the niceness
-_prioritizers = 0  # calls of raise_priority() that are not undone
+_prioritizers = 0  # number of raise_priority() calls that have not been undone
 _niceness: Final[dict[int, int]] = {}  # original niceness of each thread whose niceness was changed
 
 
 def become_prompt() -> None:
-    """Make the kernel wake up this process and its children on time, reliably only as root. Never raises.
+    """Make the kernel wake up this process and its children on time, which is reliable only as root. Never raises.
 
     This has an effect only on Linux.
     """
@@ -50,9 +50,9 @@ def become_prompt() -> None:
 
 
 def raise_priority() -> None:
-    """Prioritize all threads of this process, and those that they start, as far as permitted.
+    """Raise the priority of all threads of this process, and of the threads that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` as often restores it.
+    Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` equally often restores it.
     """
     global _prioritizers  # noqa: PLW0603
     with _priority_lock:
@@ -81,7 +81,7 @@ def _threads() -> list[int]:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the firmware until it ends or standard input does; return the exit code."""
+    """Run the firmware until it ends or standard input is closed; return the exit code."""
     cut = arguments.index("--")
     folder, log, *settings = arguments[:cut]
     prompt = PROMPT in settings

@@ -2,8 +2,8 @@
 
 Firmware with fixed ports gets a separate network, which is possible only on Linux. A socket belongs to the network in
 which it was created, whichever process holds it. The firmware's keeper therefore leaves the computer's network before
-it starts the firmware, creates the datagram socket for the firmware there, and passes it to the parent. It relays the
-bytes of the firmware's TCP port itself, to and from an inherited listener.
+it starts the firmware, creates the datagram socket for the firmware there, and passes it to the parent. The keeper
+itself relays the bytes of the firmware's TCP port, to and from an inherited listener.
 
 ``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 if separate networks are possible.
 """
@@ -70,8 +70,8 @@ def reserve_instance(
 ) -> int:
     """Return the lowest of ``most`` instance numbers whose ports are free, and reserve it within this process.
 
-    ``runs`` says whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError` if
-    no number is free.
+    ``runs`` returns whether an instance is running, even if it has not opened its ports yet. Raises :class:`UsageError`
+    if no number is free.
     """
     with _lock:
         for instance in range(most):
@@ -122,7 +122,7 @@ class Apart:
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the newest keeper's UDP socket, to be closed by the caller. Raises OSError if there is no new one."""
+        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError without a new socket."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
@@ -142,7 +142,7 @@ class Apart:
 class Relay:
     """The keeper's end. Create it while the process has only one thread: the process leaves the computer's network.
 
-    Raises OSError if that is not allowed.
+    Raises OSError if a new network is not allowed.
     """
 
     def __init__(self, option: str) -> None:

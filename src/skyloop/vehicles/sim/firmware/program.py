@@ -35,12 +35,12 @@ _LAST_BYTES: Final = 2000
 class FirmwareEventKind(StrEnum):
     """Kinds of events that firmware causes."""
 
-    STARTED = "started"  #: its process is running
-    ANSWERS = "answers"  #: it is controlling the rotors, for the first time or again
-    SILENT = "silent"  #: it has not replied for a while, so the rotors stop
-    DIED = "died"  #: its process ended and is being restarted
-    FAILED = "failed"  #: it could not be started; the start is retried
-    DEAF = "deaf"  #: its process ran but did not reply; another one is started at once
+    STARTED = "started"  #: the process is running
+    ANSWERS = "answers"  #: the firmware is controlling the rotors, for the first time or again
+    SILENT = "silent"  #: the firmware has not replied for a while, so the rotors stop
+    DIED = "died"  #: the process ended and is being restarted
+    FAILED = "failed"  #: the process could not be started; the start is retried
+    DEAF = "deaf"  #: the process ran but did not reply; another process is started at once
 
 
 class StartedInVainError(OSError):
@@ -61,8 +61,8 @@ class Launch:
 
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
-    prompt: bool = False  #: whether it needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
-    apart: Apart | None = None  #: the separate network to run in; None for the computer's
+    prompt: bool = False  #: whether the firmware needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
+    apart: Apart | None = None  #: the separate network to run in; None for the computer's network
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
         """Start the firmware in a folder, under a keeper."""
@@ -73,7 +73,7 @@ class Launch:
 class Program:
     """A firmware process that is restarted whenever it ends, until :meth:`close`.
 
-    ``starts`` counts the starts; ``pid`` is the process id, 0 while it is not running.
+    ``starts`` counts the starts; ``pid`` is the process id, or 0 while the process is not running.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Program:
         there; it raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if the firmware can't be started now.
         ``report`` is called with each event, on one of this object's threads. ``verify`` is called once the process is
         running, before the start is reported; it raises ``OSError`` to have the process ended and restarted, or
-        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and removed at the end.
+        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and later removed.
         """
         self.name = name
         self.starts = 0
@@ -229,9 +229,9 @@ def _last_words(folder: Path) -> str:
 
 # Coupled to a simulation ---------------------------------------------------------------------------------------------
 
-WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, no more waits until it replies
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, there is no waiting until the firmware replies
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
-SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports it
+SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
 
 Commands = Sequence[float]
@@ -242,16 +242,16 @@ class CoupledFirmware(ABC):
 
     It is a :class:`~skyloop.sim.instruments.Firmware`: pass it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
     The simulation's thread waits up to :data:`WAIT_S` for a reply; after a time-out it does not wait again until the
-    firmware has replied. The rotors stop if it stops replying or exits; firmware that exits is restarted.
+    firmware has replied. The rotors stop if the firmware stops replying or exits; firmware that exits is restarted.
     """
 
     NAME: ClassVar[str]  #: the firmware's name in messages
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
-        """Prepare without starting anything.
+        """Prepare to run the firmware, without starting anything.
 
         ``on_event`` is called on the simulation's or the program's thread and must return quickly. ``folder`` is where
-        the firmware keeps its settings; None for a new one that is removed at the end.
+        the firmware keeps its settings; None for a new folder that is removed at the end.
         """
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
@@ -267,12 +267,12 @@ class CoupledFirmware(ABC):
     def address(self) -> str: ...
 
     def start(self) -> None:
-        """Start the firmware. It may take a while to reply."""
+        """Start the firmware. The firmware may take a while to reply."""
         self._open()
         self.program.start()
 
     def close(self) -> None:
-        """End the firmware. Do not call it while a simulation calls :meth:`exchange`. Idempotent."""
+        """End the firmware. Do not call this method while a simulation calls :meth:`exchange`. Idempotent."""
         self.program.close()
         self._close()
 
@@ -283,7 +283,7 @@ class CoupledFirmware(ABC):
             self._starts = self.program.starts
             self._owed, self._patient, self._answered_s = False, False, None
             self._begin()
-            return STOPPED  # report this for at least one step, even if the exit was noticed late
+            return STOPPED  # report STOPPED for at least one step, even if the exit was noticed late
         commands = self._receive(WAIT_S if self._owed and self._patient else 0.0)
         if commands is not None:
             self._on_answer(readings.time_s)

@@ -1,6 +1,6 @@
 """PX4 in the simulated world, connected through MAVLink's hardware-in-the-loop messages and running in step with it.
 
-PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is its clock: PX4
+PX4 connects to a TCP server on port 4560, or one higher for each further vehicle. ``HIL_SENSOR`` is PX4's clock: PX4
 replies to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """
@@ -40,13 +40,13 @@ STATION_PORT = 18570
 MOST_INSTANCES: Final = 10  #: maximum number of instances: PX4 would use the same port for all further vehicles
 STEPS: Final = 4  #: simulation steps per step of PX4: 250 Hz, as its startup script for such simulators expects
 STEP_US: Final = 4000
-TRUTH_EVERY: Final = 5  #: number of its steps between truth messages
+TRUTH_EVERY: Final = 5  #: number of PX4 steps between truth messages
 RANGE_EVERY: Final = 10
-PROBE_EVERY: Final = 25  #: number of its steps between probes while it is silent
+PROBE_EVERY: Final = 25  #: number of PX4 steps between probes while PX4 is silent
 LOCK_FILE = "/tmp/px4_lock"
 MAX_BACKLOG: Final = 4096  #: number of unsent bytes at which PX4 is assumed to have stopped reading
 MAX_READ: Final = 65536
-#: Parameters for this vehicle. Without a remote control, it must hold position when set-points stop.
+#: Parameters for this vehicle. Without a remote control, PX4 must hold position when set-points stop.
 PARAMETERS: Final = {
     "MPC_THR_HOVER": "0.7",
     "THR_MDL_FAC": "0.78",  # thrust is the square of rotor speed, which starts at an eighth of full speed
@@ -198,7 +198,7 @@ class Px4(CoupledFirmware):
         if self._link is None:
             return
         if self._owed and not self._patient and self._answered_s is not None and self._step % (STEPS * PROBE_EVERY):
-            return  # it hangs: data sent now would be outdated by the time it reads again
+            return  # PX4 hangs: data sent now would be outdated by the time it reads again
         messages = [*self._due(readings), self._sensor(readings, inertial)]
         self._transmit(b"".join(self._codec.encode(message) for message in messages))
         self._wanted_us = self._own_us if self._patient else 0
@@ -301,7 +301,7 @@ def _commands(controls: list[float]) -> Commands | None:
 
 
 def _runs(instance: int) -> bool:
-    """Return whether a PX4 holds this instance's lock, in which case another one would exit at once."""
+    """Return whether a PX4 process holds this instance's lock, in which case another process would exit at once."""
     if sys.platform != "linux":
         return False
     asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock for the whole file

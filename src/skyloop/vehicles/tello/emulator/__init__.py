@@ -1,4 +1,4 @@
-"""An emulated Ryze Tello on the network, flying a simulated vehicle, for any program that flies the real one.
+"""An emulated Ryze Tello on the network that flies a simulated vehicle and accepts any program for the real drone.
 
 To use it at a local address, as in a test::
 
@@ -54,8 +54,8 @@ __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 REPORTS_HZ: Final = 50.0
 TAKEOFF_ALTITUDE_M: Final = 0.8  #: height at the end of a take-off, as in a recorded flight
 
-#: A small, light drone. Mass, size and flight time come from Ryze's Tello specifications; it has 3-inch rotors. The
-#: rest is as for the simulator's own vehicle.
+#: A small, light drone. Mass, size and flight time come from Ryze's Tello specifications; it has 3-inch rotors. All
+#: other parameters equal those of the simulator's own vehicle.
 TELLO: Final = VehicleParameters(
     mass_kg=0.087,
     radius_m=0.1,
@@ -75,7 +75,7 @@ LIMITS: Final = Limits(
     climb_m_s=FULL_CLIMB_M_S,
     yaw_rate_rad_s=FULL_YAW_RATE_RAD_S,
     altitude_m=10.0,
-    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # the speed with a stick in a corner
+    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # speed with the stick in a corner
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
@@ -242,7 +242,7 @@ class RunningFirmware(RunningEmulator):
 
 
 class TelloFirmware(Emulator[RunningFirmware]):
-    """The firmware of one drone in a host's world. Several can share a host, each with its own drone and address.
+    """The firmware of one drone in a host's world. A host can have several Tellos, each with its own drone and address.
 
     Create the host with options from :func:`with_tellos`.
 
@@ -289,7 +289,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The actual port, which was chosen if 0 was given."""
+        """The actual port; if 0 was given, the system chose it."""
         return self._started.port
 
     @property

@@ -3,7 +3,7 @@
 Pure: the clock is an argument, and replies are passed to a function.
 
 Replies that are not in any guide ("error Motor stop", "error Not joystick", "error No valid marker") were reported by
-users. When exactly real firmware sends them has not been verified.
+users. The exact conditions under which real firmware sends them are unverified.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from skyloop.vehicles.tello.wire import (
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
 RISES_WITHIN_S: Final = 0.5  #: simulated time without rising after which take-off was refused for a low battery
-TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although the drone hovered long before
-FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, but the drone hovered long before it
+FLIP_S: Final = 1.5  #: duration of a flip (an estimate); the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
 PATIENCE_S: Final = 30.0  #: time after which an unfinished command fails
 _NEAR_M: Final = 0.06  # maximum distance at which a move ends …
@@ -68,13 +68,13 @@ class Rising:
             self._commanded_s = now_s
             return Takeoff(), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
-            # Measured from the command, because this step may run late on a busy machine.
+            # The time is measured from the command, because this step may run late on a busy machine.
             return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
 
 
 class Landing:
-    """``land``, and the Tello's automatic landing if it receives no commands."""
+    """``land``, and the Tello's automatic landing when it receives no commands."""
 
     def step(self, report: Report) -> Step:
         if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
@@ -83,7 +83,7 @@ class Landing:
 
 
 class Flipping:
-    """``flip``; only its duration is simulated."""
+    """``flip``; only the duration is simulated."""
 
     def __init__(self, report: Report) -> None:
         self._until_s = report.truth.time_s + FLIP_S
@@ -153,7 +153,7 @@ MOVES: Final = {
     "forward": (1, 0, 0),
     "back": (-1, 0, 0),
 }  #: forward, left, up
-#: First SDK with each command, and the ranges of its integers.
+#: The first SDK version that has each command, and the ranges of the command's integers.
 NUMBERS: Final[dict[str, tuple[Sdk, tuple[Range, ...]]]] = {
     **dict.fromkeys(MOVES, (Sdk.V1_3, _MOVE)),
     "cw": (Sdk.V1_3, ((1, 3600),)),
@@ -191,7 +191,7 @@ def _refusal(sdk: Sdk) -> str:
     return "error" if sdk is Sdk.V1_3 else OUT_OF_RANGE
 
 
-USUAL_SPEED_CM_S: Final = 50  #: speed until ``speed`` sets another one
+USUAL_SPEED_CM_S: Final = 50  #: speed in force until a ``speed`` command changes it
 FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
 SIZES: Final = {"high": (960, 720), "low": (640, 480)}
 _SINCE: Final = {"stop": Sdk.V2_0, "mon": Sdk.V2_0, "moff": Sdk.V2_0, "sdk?": Sdk.V2_0, "sn?": Sdk.V2_0}
@@ -261,7 +261,7 @@ class TelloLogic:
         self._report = report
         if truth.state is FlightState.EMERGENCY:
             self._job = None
-            self._vehicle.command(ResetEmergency())  # this takes effect on the ground: a Tello has no emergency state
+            self._vehicle.command(ResetEmergency())  # the reset works on the ground: a Tello has no emergency state
         if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:
@@ -296,7 +296,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the reply, or None if there is none yet or none will come."""
+        """Execute a command. Return the reply; None if there is no reply, or not yet."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"

@@ -21,7 +21,7 @@ _VIEW: Final = 0.5  # horizontal reach of the downward camera as a fraction of t
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A pad below, and the drone's position above it in world axes, with which all pads are aligned."""
+    """A pad below, and the drone's position above it in world axes; all pads are aligned with those axes."""
 
     number: int
     place_m: tuple[float, float, float]
