@@ -155,7 +155,7 @@ class AuthorityTracker:
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """Handle a lost connection, which ends the authority; if it is to be renewed, it is still wanted."""
+        """Handle a lost connection, which ends the authority; the application still wants it if it is to be renewed."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False

@@ -545,7 +545,7 @@ class Drone:
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
             yaw: Yaw to turn to during the flight, counter-clockwise from x [rad]; None: keep the current yaw.
-            speed: Maximum speed [m/s]; None: only ``limits.speed`` and ``limits.climb`` apply, which always do.
+            speed: Maximum speed [m/s], within ``limits.speed`` and ``limits.climb``; None: these limits only.
             wait: Whether to wait until the vehicle has arrived and is nearly at rest, or only send the command.
             timeout_s: How long to wait [s].
             tolerance_m: Maximum distance from the position on arrival [m].

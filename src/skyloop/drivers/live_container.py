@@ -35,7 +35,7 @@ STRICT_S: Final = 15.0  #: time without undamaged H.264 before damage is tolerat
 #: Number of frames that FFmpeg holds back. FFmpeg detects the end of a frame only when the next frame starts, and the
 #: packets of a transport stream add the same delay once more.
 _HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
-_REORDERED_NS: Final = 1_000_000_000  # B-frames step timestamps back by less; a clock that is set back, by more
+_REORDERED_NS: Final = 1_000_000_000  # B-frames cause smaller backward steps; a clock set back causes larger ones
 _STAMPS: Final = 128  # maximum number of stored capture times: two per frame, more than any decoder holds back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 

@@ -31,7 +31,7 @@ from skyloop.messages.fields import CHANNELS
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A frame: the arguments of :meth:`skyloop.drivers.base.Sink.frame`."""
+    """The arguments of one call of :meth:`skyloop.drivers.base.Sink.frame`."""
 
     camera: str
     #: A copy of shape (height, width, 3), (height, width) or, for JPEG, (bytes,); empty if malformed or not stored.
@@ -46,7 +46,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A frame as the vehicle encoded it: the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
+    """The arguments of one call of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
